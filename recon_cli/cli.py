@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 from collections import UserDict
@@ -16,7 +17,6 @@ from recon_cli import __version__, signals
 from recon_cli.commands import console, hints
 from recon_cli.commands.options import Call
 from recon_cli.errors import ExitCode, ReconError, ReconstructionError
-from recon_cli.lazy import load
 from recon_cli.workspace import disk
 
 MAX_WIDTH = 100  # columns of a help text on a wide terminal
@@ -58,8 +58,9 @@ class _LazyCommands(UserDict[str, Any]):
     """The commands by verb; a module is imported when its verb is looked up."""
 
     def __getitem__(self, verb: str) -> click.Command:
-        place = HIDDEN.get(verb) or VERBS[verb][0]
-        command: click.Command = load(f"recon_cli.commands.{place}")
+        module, _, name = (HIDDEN.get(verb) or VERBS[verb][0]).partition(".")
+        command: click.Command = getattr(
+            importlib.import_module(f"recon_cli.commands.{module}"), name)
         return command
 
 

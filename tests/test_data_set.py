@@ -7,7 +7,7 @@ import pytest
 from posed_sets import make_replica
 
 from recon_cli.cli import main
-from recon_cli.io.ply import read_ply
+from recon_cli.splats.ply import read_ply
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from recon_cli.io.ply import read_ply
+from recon_cli.splats.ply import read_ply
 
 pytestmark = pytest.mark.integration
 

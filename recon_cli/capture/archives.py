@@ -10,9 +10,9 @@ import shlex
 from contextlib import suppress
 from pathlib import Path
 
+from recon_cli.capture.foreign import recognise_file
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.errors import InputError
-from recon_cli.io.foreign import recognise_file
 
 # First bytes, where they are, and what unpacks such a file into a folder.
 _UNPACK = "mkdir -p {folder} && {command} && recon ingest {folder}"

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
+from recon_cli.capture.foreign import find_foreign, find_lists
 from recon_cli.capture.frame_selection import FrameCandidate, Reason
 from recon_cli.capture.from_video import judge, report_reduced, report_short
 from recon_cli.capture.images import WHITE, Photo, describe_white, find_white, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
+from recon_cli.capture.mask_files import mask_folders
 from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.photo_sequence import PhotoSequence, find_odd, find_sequence
 from recon_cli.capture.photo_tree import find_photo_files
@@ -37,13 +39,11 @@ from recon_cli.capture.photos import (
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import FormatError, InputError, ManifestError, list_names
-from recon_cli.io import records as store
-from recon_cli.io.foreign import find_foreign, find_lists
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
-from recon_cli.io.mask_files import mask_folders
-from recon_cli.io.records import Frame, Group
 from recon_cli.io.tracks import Tracks
 from recon_cli.workspace import atomic
+from recon_cli.workspace import records as store
+from recon_cli.workspace.records import Frame, Group
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
 SEQUENCE = "sequence.json"  # which photos follow each other, for the next run; beside a scan

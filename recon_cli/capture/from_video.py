@@ -20,9 +20,9 @@ from recon_cli.capture.static_overlay import MOST, PICTURE, draw_overlay, mask_o
 from recon_cli.capture.video import frames_at, read_declared_length
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
-from recon_cli.io import records as store
 from recon_cli.io.images import fit_image, fit_size, write_png
-from recon_cli.io.records import Frame, Group
+from recon_cli.workspace import records as store
+from recon_cli.workspace.records import Frame, Group
 
 SCAN = "scan.json"  # a scan for the next run; the prefix of the video's frames comes before it
 # A count by the duration may be off by this much, as a share or in frames, without any loss.

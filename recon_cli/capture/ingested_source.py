@@ -9,9 +9,9 @@ from typing import Protocol
 
 from recon_cli.capture.contact_sheet import SHEET, ContactSheet
 from recon_cli.capture.frame_selection import CHOICE, FrameCandidate, write_choice
-from recon_cli.io.records import Frame, Group, KnownPoses
 from recon_cli.io.tracks import Tracks, merge_tracks
 from recon_cli.progress import Progress
+from recon_cli.workspace.records import Frame, Group, KnownPoses
 
 
 class IngestContext(Protocol):

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.images import Photo, read_alpha, read_rgb
+from recon_cli.capture.mask_files import mask_folders, match_masks
 from recon_cli.errors import InputError
-from recon_cli.io.mask_files import mask_folders, match_masks
 from recon_cli.workspace import atomic
 
 HALF = 128  # from this value on a pixel is white, or opaque

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from recon_cli.capture.archives import is_archive
+from recon_cli.capture.foreign import Found, find_foreign
 from recon_cli.capture.images import PHOTO_SUFFIXES, inspect_photo
+from recon_cli.capture.mask_files import FOLDERS as MASK_FOLDERS
+from recon_cli.capture.picture_names import picture_kind
 from recon_cli.errors import InputError, list_names
-from recon_cli.io.foreign import Found, find_foreign
-from recon_cli.io.mask_files import FOLDERS as MASK_FOLDERS
-from recon_cli.io.picture_names import picture_kind
 from recon_cli.workspace.layout import Workspace
 
 VIDEO_SUFFIXES = frozenset({

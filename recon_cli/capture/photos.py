@@ -13,8 +13,8 @@ from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
 from recon_cli.capture.panoramas import find_panoramas, panorama_advice, panorama_error
 from recon_cli.capture.photo_tree import VIDEO_SUFFIXES
+from recon_cli.capture.picture_names import picture_kind
 from recon_cli.errors import InputError, list_names
-from recon_cli.io.picture_names import picture_kind
 
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 _COLOURED = frozenset({"RGB", "RGBA", "RGBX", "P", "PA", "CMYK", "YCbCr", "LAB", "HSV"})

@@ -12,7 +12,7 @@ from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.errors import ReconstructionError, WorkspaceError
-from recon_cli.executors.shared_jobs import describe_failures
+from recon_cli.jobs.shared_jobs import describe_failures
 from recon_cli.pipeline.batch import CaptureResult, name_captures, run_batch
 from recon_cli.progress import TqdmProgress, format_duration, hide_bars
 from recon_cli.workspace.layout import disk_errors, hold_lock

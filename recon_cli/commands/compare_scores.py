@@ -15,7 +15,9 @@ from recon_cli.evaluation.comparison import (
     read_workspace_scores,
     score_file,
 )
-from recon_cli.evaluation.reference_views import ReferenceView, load_held_out_views, load_scene
+from recon_cli.evaluation.reference_views import load_held_out_views
+from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import ReferenceView
 from recon_cli.pipeline import execute, plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.plan import Target
@@ -79,5 +81,5 @@ def _load_held_out(
         max_size = (read_config(job.workspace.folder("train")) if trained
                     else QUALITIES["normal"]).max_size
     ctx = execute.stage_context(job, stage("evaluate"), lambda _done, _total: None)
-    views = load_held_out_views(load_scene(inputs, validation=0.0), max_size, ctx)
+    views = load_held_out_views(load_scene(inputs.folders, validation=0.0), max_size, ctx)
     return job.workspace.root.name, views, ctx

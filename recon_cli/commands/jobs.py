@@ -14,7 +14,7 @@ from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import TrainCallback
-from recon_cli.executors.executor import NEEDS_GPU, Executor, start_executor
+from recon_cli.jobs.executor import NEEDS_GPU, Executor, start_executor
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.plan import Job, Outcome, Target

@@ -27,7 +27,7 @@ from recon_cli.config.settings import (
     section_of,
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
-from recon_cli.executors.executor import CORES
+from recon_cli.jobs.executor import CORES
 from recon_cli.workspace.paths import refuse_special
 
 if TYPE_CHECKING:

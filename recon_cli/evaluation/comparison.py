@@ -14,11 +14,7 @@ from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import CONVENTION_LINES, CONVENTIONS, MASK_CONVENTION
-from recon_cli.evaluation.reference_views import (
-    ReferenceView,
-    reference_digest,
-    score_views,
-)
+from recon_cli.evaluation.reference_views import reference_digest, score_views
 from recon_cli.evaluation.scores import (
     Metrics,
     ModelMetrics,
@@ -27,9 +23,10 @@ from recon_cli.evaluation.scores import (
     model_table,
     paper_table,
 )
-from recon_cli.io.splats.registry import read_splats
+from recon_cli.io.views import ReferenceView
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
+from recon_cli.splats.registry import read_splats
 from recon_cli.workspace.atomic import read_json
 
 _TRANSFORM = "transform.json"  # that an export leaves beside its files

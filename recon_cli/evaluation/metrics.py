@@ -5,7 +5,6 @@ LPIPS is optional: it needs an extra package and weights, and neither is ever do
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
+
+from recon_cli.scene.train_view import BORDER, MIN_SIDE, without_border
 
 PSNR_CONVENTION = "mean of per-image dB, float render clamped to [0, 1] against 8-bit truth"
 PSNR_8BIT_CONVENTION = "the same of the render rounded to 8 bits, as a picture file holds it"
@@ -30,18 +31,10 @@ CONVENTIONS: dict[str, Any] = {  # as JSON files hold them
 CONVENTION_LINES = (  # below tables
     f"PSNR: {PSNR_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\nSSIM: {SSIM_CONVENTION}\n"
     f"SSIM 0-pad: {SSIM_PADDED_CONVENTION}\n")
-MIN_SIDE = 11  # pixels; the window of SSIM
-MIN_PIXELS = MIN_SIDE**2  # that a mask must leave: one window of SSIM
 _MAX_DB = 100.0  # of equal images, which JSON cannot hold
-_BORDER = MIN_SIDE // 2  # pixels; what scikit-image crops, where the window reaches outside
 _LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them
 
 Perceptual = Callable[[NDArray[np.float32], NDArray[np.uint8]], float]
-
-
-def leaves_enough(mask: NDArray[np.bool_] | None) -> bool:
-    """Returns whether a mask [H, W] leaves MIN_PIXELS pixels off the border; None leaves all."""
-    return mask is None or int(np.count_nonzero(_crop(mask))) >= MIN_PIXELS
 
 
 def psnr(
@@ -85,17 +78,17 @@ def ssim(
         raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
     rendered, true = _unit(image), truth / 255.0
     if mask is not None:
-        if not _crop(mask).any():
+        if not without_border(mask).any():
             raise ValueError("SSIM of a mask that leaves no pixel off the border")
         rendered = np.where(mask[..., None], rendered, true)
     if padded:  # what is cropped below is then the padding
-        around = ((_BORDER, _BORDER), (_BORDER, _BORDER))
+        around = ((BORDER, BORDER), (BORDER, BORDER))
         rendered, true = (np.pad(pixels, (*around, (0, 0))) for pixels in (rendered, true))
         mask = None if mask is None else np.pad(mask, around)
     value, similarity = structural_similarity(
         rendered, true, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         data_range=1.0, channel_axis=-1, full=True)
-    return float(value if mask is None else _crop(similarity)[_crop(mask)].mean())
+    return float(value if mask is None else without_border(similarity)[without_border(mask)].mean())
 
 
 def load_lpips() -> tuple[Perceptual | None, str]:
@@ -104,7 +97,7 @@ def load_lpips() -> tuple[Perceptual | None, str]:
     (Zhang et al. 2018.) The weights of its backbone must be in torchvision's cache.
     """
     try:
-        lpips: Any = importlib.import_module("lpips")
+        import lpips
     except ModuleNotFoundError:
         return None, "the package lpips is not installed (pip install 'recon-cli[lpips]')"
     except (ImportError, OSError, RuntimeError) as error:  # torchvision was built for another torch
@@ -130,8 +123,3 @@ def _unit(image: NDArray[Any]) -> NDArray[np.float64]:
     """Returns an image in [0, 1]."""
     unit = image / 255.0 if image.dtype == np.uint8 else np.clip(image, 0, 1)
     return np.asarray(unit, np.float64)
-
-
-def _crop(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Returns [H, W, ...] without the border that SSIM leaves out."""
-    return pixels[_BORDER:-_BORDER, _BORDER:-_BORDER]

@@ -1,55 +1,34 @@
-"""Reference views: photos at the size they are scored at, with masks, on black."""
+"""Reference views: photos at the size they are scored at, and the scores of renders."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.context import StageContext, StageInputs
+from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.evaluation.metrics import (
-    MIN_PIXELS,
-    MIN_SIDE,
-    Perceptual,
-    corrected_psnr,
-    leaves_enough,
-    psnr,
-    ssim,
-)
+from recon_cli.evaluation.metrics import Perceptual, corrected_psnr, psnr, ssim
 from recon_cli.evaluation.scores import MeanScore, ViewScore
-from recon_cli.io.colmap import read_scene
-from recon_cli.io.images import fit_camera, read_masked_image, to_uint8
-from recon_cli.io.records import read_frame_list
+from recon_cli.io.images import fit_camera, to_uint8
+from recon_cli.io.views import MASK_HINT, ReferenceView, load_views
 from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
-from recon_cli.scene.train_view import TrainView
-from recon_cli.workspace.summaries import WorldSummary
+from recon_cli.scene.train_view import MIN_SIDE, TrainView
 
-MASK_HINT = "Run `recon ingest` with masks that hide less."
 _AT_ONCE = 4  # views a thread: renders that are in memory together
 _Item = TypeVar("_Item")
 _View = TypeVar("_View", bound=TrainView)
-
-
-@dataclass(frozen=True, eq=False)
-class ReferenceView(TrainView):
-    """A view with its original pixels, at the size it is scored at."""
-
-    name: str = field(kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -60,32 +39,6 @@ class RenderScores:
     # Mean PSNR after the best gain per channel of each view, whose exposure is unknown.
     corrected_db: float
     render_ms: float  # median milliseconds a view
-
-
-def held_out_names(ingest: Path) -> frozenset[str]:
-    """Returns the names of the frames that ingest held out for the score."""
-    return frozenset(frame.name for frame in read_frame_list(ingest).frames if frame.held_out)
-
-
-def load_scene(
-    inputs: StageInputs, *, validation: float | frozenset[str], sparse: Path | None = None
-) -> Scene:
-    """Returns the views and points that sfm left, split by what each may be used for.
-
-    `validation` are the names of views to look at only, or their share; `sparse` is the folder of a
-    model with a part of the views and points.
-    """
-    sfm, held_out = inputs.folders["sfm"], held_out_names(inputs.folders["ingest"])
-    scene = read_scene(
-        sfm / "undistorted", held_out=held_out, validation=validation, sparse=sparse)
-    world = WorldSummary.read(sfm)
-    up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
-    return dataclasses.replace(scene, up=up)
-
-
-def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:
-    """Returns at most `most` of the items, evenly spread."""
-    return items[:: max(1, -(-len(items) // most))]
 
 
 def load_reference_views(
@@ -101,33 +54,8 @@ def load_reference_views(
             raise ConfigError(
                 f"Views of {camera.width}x{camera.height} pixels are too small to score; SSIM "
                 f"needs {MIN_SIDE} pixels a side.", hint="Use a larger --max-size.")
-    return load_views(views, max_size, "not scored", ctx, threads=threads)
-
-
-def load_views(
-    views: Sequence[View], max_size: int, consequence: str, ctx: StageContext | None = None, *,
-    denoised: bool = False, threads: int = 1, file: ImageFile | None = None,
-) -> list[ReferenceView]:
-    """Returns views without those whose mask leaves too little; a notice gives the consequence.
-
-    Their images are put into `file`, if any.
-    """
-    def read(view: View) -> ReferenceView:
-        camera = fit_camera(view.camera, max_size)
-        path = view.denoised if denoised else view.original
-        image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
-        if file is not None:
-            image = file.put(image)
-        return ReferenceView(camera, image, mask, name=view.name, file=file)
-
-    with ThreadPoolExecutor(threads) as pool:
-        every = list(pool.map(read, views))
-    loaded = [view for view in every if leaves_enough(view.mask)]
-    hidden = [view.name for view in every if not leaves_enough(view.mask)]
-    if hidden and ctx is not None:
-        ctx.notice(f"{len(hidden)} views are {consequence}: their masks leave fewer than "
-                   f"{MIN_PIXELS} pixels: {', '.join(hidden)}")
-    return loaded
+    return load_views(
+        views, max_size, "not scored", ctx.notice if ctx is not None else None, threads=threads)
 
 
 def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[ReferenceView]:
@@ -256,16 +184,3 @@ def reference_digest(views: Sequence[ReferenceView]) -> str:
             if pixels is not None:
                 digest.update(np.ascontiguousarray(pixels).tobytes())
     return digest.hexdigest()
-
-
-def size_summary(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """Returns width and height of the largest camera; where sizes differ also all as `sizes`."""
-    sizes = sizes_of(cameras)
-    summary: dict[str, Any] = {"width": sizes[0][0], "height": sizes[0][1]}
-    return summary if len(sizes) == 1 else {**summary, "sizes": tuple(sizes)}
-
-
-def sizes_of(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Returns the different (width, height) of cameras, the one of most pixels first."""
-    sizes = {(camera.width, camera.height) for camera in cameras}
-    return sorted(sizes, key=lambda size: (size[0] * size[1], size), reverse=True)

@@ -30,11 +30,11 @@ from recon_cli.experiments.bench_scene import (
     variants_for,
 )
 from recon_cli.experiments.instruments import Host, Samples, Stopwatch, Timing, timing_of
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.progress import Bar, Progress
 from recon_cli.render import registry
 from recon_cli.render.contract import Renderer, RenderOutput, StepOptions
 from recon_cli.render.numba.loss import C1, C2, MAPS, RADIUS, photometric, taps
-from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer

@@ -21,11 +21,11 @@ from recon_cli.config.stages import DenoiseConfig
 from recon_cli.evaluation.scores import Table
 from recon_cli.experiments.runner import run_grid
 from recon_cli.io.images import read_png
-from recon_cli.io.records import FOLDER, read_frame_list
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
+from recon_cli.workspace.records import FOLDER, read_frame_list
 
 RESULT = "compare.json"
 _SAMPLES = 3  # frames, spread over the capture: 20 s in all at 1080x1920 on one core

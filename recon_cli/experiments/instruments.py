@@ -19,13 +19,13 @@ import psutil
 import torch
 
 from recon_cli import machine
+from recon_cli.kernels.kernel import kernel
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import fill, fma, store
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.processes import run_code
 from recon_cli.render import registry
 from recon_cli.render.contract import RenderOutput
-from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import fill, fma, store
-from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import blocks, tiles
 
 # OpenMP's threads of the previous candidate keep spinning for some milliseconds after their work.

@@ -30,11 +30,11 @@ from recon_cli.evaluation.scores import MeanScore
 from recon_cli.experiments.instruments import Host, examine
 from recon_cli.experiments.scenes import LoadedScene, load_for_training, open_scene
 from recon_cli.experiments.variants import MidPrune, TrainingRun, Variant
-from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import stage
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state

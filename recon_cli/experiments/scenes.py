@@ -12,16 +12,12 @@ from typing import Any
 from recon_cli.config.settings import Settings, build, merge
 from recon_cli.config.stages import ComputeConfig, IngestConfig, RunConfig, SfmConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.datasets.layouts import recognise, refuse_incomplete
 from recon_cli.errors import ConfigError, InputError, ReconstructionError
-from recon_cli.evaluation.reference_views import (
-    MASK_HINT,
-    ReferenceView,
-    held_out_names,
-    load_reference_views,
-    load_scene,
-)
+from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.variants import TrainingRun
-from recon_cli.io.layouts import recognise, refuse_incomplete
+from recon_cli.io.training_scene import held_out_names, load_scene
+from recon_cli.io.views import MASK_HINT, ReferenceView
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.progress import Progress
@@ -153,7 +149,7 @@ def load_for_training(
         ReconstructionError: no held-out view has a camera.
         ConfigError: there are no validation views, the views are too small, or masks leave none.
     """
-    scene = load_scene(folders.inputs, validation=base.validation)
+    scene = load_scene(folders.inputs.folders, validation=base.validation)
     if split == "test" and not scene.test:
         raise ReconstructionError(
             f"No held-out view of {folders.name} has a camera.",

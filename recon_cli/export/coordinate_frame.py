@@ -12,17 +12,18 @@ from recon_cli.config.stages import PLAN, ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
-from recon_cli.io.records import ImportRecord, has_views
+from recon_cli.room.measures import RoomFrame
+from recon_cli.room.scale import ARBITRARY, MEASURED, Measurement, ScaleBetween, measure
 from recon_cli.scene.gravity import camera_up, find_gravity, turn_onto
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.align_world import ARBITRARY, MEASURED, Measurement, ScaleBetween, measure
+from recon_cli.workspace.records import ImportRecord, has_views
 from recon_cli.workspace.summaries import WorldSummary
 
 _UP = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 
 _RIGID = 1e-6  # difference of a scale from 1
 # Relative error of --scale-between with two pixels: the depth of a pick in the middle was 0.5% and
-# 0.7% off in two rendered rooms; see sfm/align_world.py.
+# 0.7% off in two rendered rooms; see room/scale.py.
 _PICKED_SCALE_ERROR = 0.007
 
 logger = logging.getLogger("recon")
@@ -57,14 +58,6 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
                 "last column.") from error
         similarity = transform.after(similarity)
     return ExportFrame(similarity, similarity.rotation @ up, measurement)
-
-
-@dataclass(frozen=True, eq=False)
-class RoomFrame:
-    """What measures need to know of the exported world: its unit is the metre."""
-
-    up: NDArray[np.float64]  # [3] unit vector
-    scale_error: float  # relative standard error of the scale
 
 
 def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:

@@ -17,38 +17,39 @@ from torch import Tensor
 
 from recon_cli.config.stages import MESH_FORMATS, PLAN, ExportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.datasets.transforms import write_transforms
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.evaluation.reference_views import evenly_spread, load_scene
 from recon_cli.export.cleanup import drop_floaters, drop_islands
 from recon_cli.export.coordinate_frame import ExportFrame, find_room_frame
-from recon_cli.export.mesh.build import MeshResult, build_mesh
-from recon_cli.export.mesh.files import write_mesh_file, write_plan
 from recon_cli.export.reduce import LowerDegrees, crop, fit_to_size, measure_change
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.images import fit_camera
 from recon_cli.io.meshes import write_point_cloud
-from recon_cli.io.ply import describe_scene, write_ply, write_points
-from recon_cli.io.records import ImportRecord, has_views, read_frame_list
-from recon_cli.io.splats.axes import PLY, Z_UP
-from recon_cli.io.splats.compressed_ply import write_compressed_ply
-from recon_cli.io.splats.glb import nearest_axes, nearest_up, write_glb
-from recon_cli.io.splats.html import write_html
-from recon_cli.io.splats.lod import LOD_META, make_levels, write_lod
-from recon_cli.io.splats.registry import FORMATS, scene_file
-from recon_cli.io.splats.sog import SHARING, write_sog
-from recon_cli.io.splats.splat import write_splat
-from recon_cli.io.splats.spz import LARGEST_SCALE, write_spz
-from recon_cli.io.transforms import write_transforms
+from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import evenly_spread
+from recon_cli.room.files import write_mesh_file, write_plan
+from recon_cli.room.mesh import MeshResult, build_mesh
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.axes import PLY, Z_UP
+from recon_cli.splats.compressed_ply import write_compressed_ply
+from recon_cli.splats.glb import nearest_axes, nearest_up, write_glb
+from recon_cli.splats.html import write_html
+from recon_cli.splats.lod import LOD_META, make_levels, write_lod
+from recon_cli.splats.ply import describe_scene, write_ply, write_points
+from recon_cli.splats.registry import FORMATS, scene_file
+from recon_cli.splats.sog import SHARING, write_sog
+from recon_cli.splats.splat import write_splat
+from recon_cli.splats.spz import LARGEST_SCALE, write_spz
 from recon_cli.train.finished_model import FINAL
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.train_data import load_views, read_config
 from recon_cli.workspace.export_record import ExportChange, ExportedFile, max_loss_db
+from recon_cli.workspace.records import ImportRecord, has_views, read_frame_list
 
 # What an .spz says of its axes, by up. Without a name all programs show it as it is, with y up.
 _SPZ_AXES = {"z": Z_UP, "-y": PLY, "y": None}
@@ -311,7 +312,7 @@ class Exporter:
     @cached_property
     def _scene(self) -> Scene:
         if self._has_views:
-            return load_scene(self._inputs, validation=self._train.validation)
+            return load_scene(self._inputs.folders, validation=self._train.validation)
         record = ImportRecord.read(self._inputs.folders["train"])
         assert self._whole is not None
         assert record is not None, "trained without views"

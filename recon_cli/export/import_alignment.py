@@ -16,12 +16,8 @@ import numpy as np
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, ReconstructionError
 from recon_cli.evaluation.metrics import psnr
-from recon_cli.evaluation.reference_views import (
-    ReferenceView,
-    evenly_spread,
-    load_reference_views,
-    mean_psnr,
-)
+from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr
+from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed

@@ -7,26 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError, WorkspaceError
-from recon_cli.evaluation.reference_views import (
-    MASK_HINT,
-    ReferenceView,
-    evenly_spread,
-    load_reference_views,
-    mean_psnr,
-)
-from recon_cli.io.meshes import Mesh, read_mesh
-from recon_cli.io.ply import read_ply
+from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr
+from recon_cli.io.views import MASK_HINT, ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, with_rows
+from recon_cli.splats.ply import read_ply
 
-_ROUNDING = 1e-6  # of the largest coordinate: float32, and eight digits of text
 _VIEWS = 8  # rendered for each file, at most
 
 
@@ -41,20 +32,6 @@ def verify_ply(path: Path, splats: Splats) -> None:
             raise WorkspaceError(
                 f"{path} reads back with a different {name} than was written.",
                 hint="Check the disk, then run `recon export --again`.")
-
-
-def verify_mesh(path: Path, mesh: Mesh, axes: NDArray[np.float64] | None) -> None:
-    """Raises WorkspaceError unless a file reads back as this mesh, in the axes of the file."""
-    back = read_mesh(path)
-    vertices = mesh.vertices if axes is None else mesh.vertices @ axes.T
-    size = float(np.abs(vertices).max())
-    same = (np.array_equal(back.faces, mesh.faces) and back.vertices.shape == vertices.shape
-            and np.abs(back.vertices - vertices).max() <= _ROUNDING * size
-            and np.abs(back.colors.astype(int) - mesh.colors).max() <= 1)
-    if not same:
-        raise WorkspaceError(
-            f"{path} reads back as another mesh than was written.",
-            hint="Check the disk, then run `recon export --again`.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.datasets.transforms import read_number
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
-from recon_cli.io.transforms import read_number
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.atomic import read_json, write_json
 

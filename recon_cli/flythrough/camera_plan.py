@@ -16,10 +16,9 @@ from recon_cli.flythrough.camera_path import CameraPath, read_camera_path
 from recon_cli.flythrough.paths import find_look_at, orbit_path, smooth_path
 from recon_cli.flythrough.request import FPS, ORBIT, TRAINING, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene
-from recon_cli.io.calibration import MAX_SIDE
 from recon_cli.io.images import fit_camera, fit_size
 from recon_cli.machine import free_memory_bytes
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import MAX_SIDE, Camera
 from recon_cli.scene.scene import Scene, View
 
 # Of a frame with all outputs, from 1200x680 to 3000x1700 pixels: 55 with numba, 93 with torch.

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from recon_cli.context import StageInputs
 from recon_cli.errors import StageError
-from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.export.synthetic_cameras import synthetic_scene
-from recon_cli.io.ply import read_ply
-from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord
+from recon_cli.io.training_scene import load_scene
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.scene_trust import digest_of
 from recon_cli.workspace.manifest import Manifest
+from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord
 from recon_cli.workspace.summaries import SfmSummary
 
 _NEEDS = ("ingest", "train", "sfm")  # training runs sfm first where that is missing too
@@ -86,7 +86,7 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
         z_up, metres = origin.z_up, False
     else:
         inputs = StageInputs({name: folder(name) for name in _NEEDS})
-        scene = load_scene(inputs, validation=config.validation)
+        scene = load_scene(inputs.folders, validation=config.validation)
         evidence = SfmSummary.from_json(manifests["sfm"].run.summary).world.evidence
         z_up, metres = evidence.up_found, evidence.metres
     return TrainedScene(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -11,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.scene.camera import MODELS, Lens, make_lens
 
 # Entries of three decimals are off by 5e-4, so R R^T by up to 2 * sqrt(3) * 5e-4 = 1.7e-3.
 ORTHONORMAL = 2e-3
 FARTHEST = 1e9  # UTM, the largest coordinates in use, reach 1e7 metres
-MAX_SIDE = 1 << 16  # pixels; no image format in use holds a longer side
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # y up and z backward, from y down and z forward
 _HINT = "Export the poses again, or take the image out of the list."
 
@@ -94,25 +91,6 @@ def _fault(rotation: NDArray[np.float64], askew: float) -> str:
 
 def _numbers(values: NDArray[np.float64]) -> str:
     return " ".join(f"{value:.4g}" for value in values)
-
-
-def make_lens(model: str, width: float, height: float, params: Sequence[float], where: str) -> Lens:
-    """Returns the intrinsics of a file; FormatError if they are unknown or implausible."""
-    if model not in MODELS:
-        raise FormatError(
-            f"{where} has the camera model {model}, known are {', '.join(MODELS)}.",
-            hint="Undistort the images first, for example with COLMAP's image_undistorter.")
-    focals, count = MODELS[model]
-    if len(params) != count:
-        raise FormatError(
-            f"{where}: {model} takes {count} parameters, but there are {len(params)}.")
-    if not all(map(math.isfinite, [width, height, *params])):
-        raise FormatError(f"{where} has intrinsics that are not finite.")
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE) or min(params[:focals]) <= 0:
-        raise FormatError(
-            f"{where} has a camera of {width:g}x{height:g} pixels with the focal length "
-            f"{min(params[:focals]):g}: no camera.")
-    return Lens(model, round(width), round(height), tuple(float(value) for value in params))
 
 
 def lens_from_matrix(matrix: NDArray[np.float64], width: int, height: int, where: str) -> Lens:

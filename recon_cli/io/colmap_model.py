@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.calibration import make_lens
 from recon_cli.io.colmap import Reader, model_error, pose_matrix, read_images, read_points
-from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.scene.camera import MODELS, Lens, make_lens
 from recon_cli.workspace.paths import refuse_special
 
 # COLMAP's ids of its camera models, src/colmap/sensor/models.h and pycolmap 4.2's CameraModelId.

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.records import AGAIN
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import read_bytes, write_bytes
+from recon_cli.workspace.records import AGAIN
 
 _COUNTS = 255  # in a mask file; anything less is ignored, half-covered edges included
 _PNG = b"\x89PNG\r\n\x1a\n"  # what every PNG begins with

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from recon_cli.errors import ConfigError, ReconError
-from recon_cli.executors.executor import Command, Executor
-from recon_cli.executors.shared_jobs import JobEnd, SharedJob, run_jobs
+from recon_cli.jobs.executor import Command, Executor
+from recon_cli.jobs.shared_jobs import JobEnd, SharedJob, run_jobs
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job, last_sources
 from recon_cli.progress import Progress

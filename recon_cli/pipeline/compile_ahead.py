@@ -13,7 +13,7 @@ from recon_cli import machine
 from recon_cli.pipeline.execute import Job
 from recon_cli.processes import start_module
 
-_SOURCES = Path(__file__).parents[1] / "render"
+_SOURCES = Path(__file__).parents[1]
 _DRIVER = Path("/proc/driver/nvidia/version")  # of an NVIDIA GPU
 _KILL_SECONDS = 10.0
 _LOG_TAIL = 2000  # characters
@@ -65,7 +65,7 @@ def _needs_kernels(backend: str, device: str) -> bool:
 def _made_since_installed(marks: str, package: str) -> bool:
     """Returns whether one of the marks in the cache is newer than a backend's package."""
     found = importlib.util.find_spec(package)
-    sources = [*(_SOURCES / package).glob("*.py")]
+    sources = [*_SOURCES.glob(f"render/{package}/*.py"), *_SOURCES.glob("kernels/*.py")]
     sources += [Path(found.origin)] if found and found.origin else []
     installed = max((path.stat().st_ctime for path in sources), default=0.0)
     return any(mark.stat().st_mtime > installed for mark in machine.cache_root().glob(marks))

@@ -19,7 +19,6 @@ from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import EarlierResult, StageContext, StageInputs, TrainCallback
 from recon_cli.errors import ConfigError, ManifestError, ReconError
-from recon_cli.lazy import load
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.progress import NullProgress, Progress
@@ -96,7 +95,7 @@ def run_stage(
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
     with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
-        run_it = load(f"{row.module}.run")
+        run_it = import_module(row.module).run
         with importing_ahead(job) as on_idle:
             summary: JsonRecord = run_it(
                 config, inputs, out, dataclasses.replace(ctx, on_idle=on_idle))
@@ -172,10 +171,12 @@ def importing_ahead(job: Job) -> Iterator[Callable[[], None]]:
 
 def _load_quietly(row: Stage, compute: ComputeConfig) -> None:
     with suppress(Exception):  # of any package; whoever needs it imports it again, and fails then
-        load(f"{row.module}.run")
-        if (load("recon_cli.render.registry.renders_on_cpu")(compute.backend, compute.device)
-                and not load("recon_cli.render.registry.kernels_to_compile")("numba")):
-            load("recon_cli.render.registry.prepare")("numba", lambda: None)
+        import_module(row.module)
+        from recon_cli.render import registry
+
+        if (registry.renders_on_cpu(compute.backend, compute.device)
+                and not registry.kernels_to_compile("numba")):
+            registry.prepare("numba", lambda: None)
 
 
 @contextmanager
@@ -253,29 +254,26 @@ def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:
     Raises:
         BackendError: what was asked for is not available.
     """
+    from recon_cli.render import registry  # imports torch
+
     threads = compute.threads or machine.usable_threads()
-    backend, device = _resolve_backend(compute)
-    load("recon_cli.render.registry.use_threads")(backend, threads)
+    backend, device = registry.resolve(compute.backend, compute.device)
+    registry.use_threads(backend, threads)
     _prepare_kernels(progress, backend)
     most = None if compute.max_memory is None else int(compute.max_memory * 1e9)
     return StageContext(progress, device, backend, threads, max_memory_bytes=most)
 
 
-def _resolve_backend(compute: ComputeConfig) -> tuple[str, str]:
-    """Returns (backend, device); raises BackendError where they are missing."""
-    backend, device = load("recon_cli.render.registry.resolve")(compute.backend, compute.device)
-    return backend, device
-
-
 def _prepare_kernels(progress: Progress, backend: str) -> None:
     """Loads the kernels of a backend; shows a bar where they must be compiled first."""
-    prepare = load("recon_cli.render.registry.prepare")
-    count = load("recon_cli.render.registry.kernels_to_compile")(backend)
+    from recon_cli.render import registry  # imports torch
+
+    count = registry.kernels_to_compile(backend)
     if not count:  # kernels that turn out to be damaged are compiled here too
-        prepare(backend, lambda: None)
+        registry.prepare(backend, lambda: None)
         return
     with progress.bar("compile for this CPU, once", count, unit="kernel") as bar:
-        seconds = prepare(backend, bar.advance)
+        seconds = registry.prepare(backend, bar.advance)
     logger.info("kernels compiled in %.1f s", seconds)
 
 
@@ -283,4 +281,6 @@ def refuse_missing_backend(job: Job, stages: Sequence[str]) -> None:
     """Raises BackendError where one of `stages` renders with a named backend that is missing."""
     named = (job.compute.device, job.compute.backend) != ("auto", "auto")
     if named and any(row.renders for row in job.table if row.name in stages):
-        _resolve_backend(job.compute)
+        from recon_cli.render import registry  # imports torch
+
+        registry.resolve(job.compute.backend, job.compute.device)

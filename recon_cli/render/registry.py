@@ -130,7 +130,7 @@ def renders_on_cpu(backend: str, device: str) -> bool:
 def use_threads(backend: str, threads: int) -> None:
     """Lets a backend compute with `threads` CPU threads from now on."""
     if backend == "numba":
-        from recon_cli.render.numba.thread_pool import pool
+        from recon_cli.kernels.thread_pool import pool
 
         pool.threads = threads
         # torch's own threads spin after each operation and would take the cores from the kernels

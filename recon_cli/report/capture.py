@@ -21,7 +21,6 @@ from recon_cli.config.stages import TrainConfig
 from recon_cli.errors import FormatError, list_names
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fit_image, read_png
-from recon_cli.io.records import FOLDER, Frame, describe_stretches, read_frame_list
 from recon_cli.report.chart import draw_mark, legend_item
 from recon_cli.report.gallery import data_uri, encode_sheet
 from recon_cli.report.stage_status import StageReports
@@ -29,6 +28,7 @@ from recon_cli.report.trust_section import read_regions
 from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene, View
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
+from recon_cli.workspace.records import FOLDER, Frame, describe_stretches, read_frame_list
 from recon_cli.workspace.summaries import SfmSummary
 
 _SHEETS = 4  # contact sheets on the page; a capture may have many sources

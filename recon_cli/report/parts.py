@@ -17,12 +17,12 @@ from markupsafe import Markup
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap import read_images, read_points
 from recon_cli.io.images import fit_image, read_png
-from recon_cli.io.records import FOLDER, Frame, read_frame_list
 from recon_cli.report.capture import draw_plan, find_axes
 from recon_cli.report.gallery import data_uri
 from recon_cli.report.stage_status import StageReports
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
+from recon_cli.workspace.records import FOLDER, Frame, read_frame_list
 from recon_cli.workspace.summaries import PartSummary, SfmSummary
 
 _MOST = 12  # parts on the page

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from recon_cli.errors import FormatError
 
 # Number of focal lengths that the parameters begin with, and of all parameters, by COLMAP's names
 # (src/colmap/sensor/models.h). The principal point follows the focal lengths.
@@ -13,6 +17,7 @@ MODELS: dict[str, tuple[int, int]] = {
     "SIMPLE_PINHOLE": (1, 3), "PINHOLE": (2, 4), "SIMPLE_RADIAL": (1, 4), "RADIAL": (1, 5),
     "OPENCV": (2, 8), "OPENCV_FISHEYE": (2, 8), "FULL_OPENCV": (2, 12),
     "SIMPLE_RADIAL_FISHEYE": (1, 4), "RADIAL_FISHEYE": (1, 5), "THIN_PRISM_FISHEYE": (2, 12)}
+MAX_SIDE = 1 << 16  # pixels; no image format in use holds a longer side
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,25 @@ class Lens:
         inner = [value * scale for value, scale in zip(self.params, scales, strict=False)]
         return replace(
             self, width=width, height=height, params=(*inner, *self.params[len(scales):]))
+
+
+def make_lens(model: str, width: float, height: float, params: Sequence[float], where: str) -> Lens:
+    """Returns the intrinsics of a file; FormatError if they are unknown or implausible."""
+    if model not in MODELS:
+        raise FormatError(
+            f"{where} has the camera model {model}, known are {', '.join(MODELS)}.",
+            hint="Undistort the images first, for example with COLMAP's image_undistorter.")
+    focals, count = MODELS[model]
+    if len(params) != count:
+        raise FormatError(
+            f"{where}: {model} takes {count} parameters, but there are {len(params)}.")
+    if not all(map(math.isfinite, [width, height, *params])):
+        raise FormatError(f"{where} has intrinsics that are not finite.")
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE) or min(params[:focals]) <= 0:
+        raise FormatError(
+            f"{where} has a camera of {width:g}x{height:g} pixels with the focal length "
+            f"{min(params[:focals]):g}: no camera.")
+    return Lens(model, round(width), round(height), tuple(float(value) for value in params))
 
 
 @dataclass(frozen=True, eq=False)

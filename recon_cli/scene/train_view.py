@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,10 @@ from torch import Tensor
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.image_file import ImageFile
+
+MIN_SIDE = 11  # pixels; the window of SSIM
+MIN_PIXELS = MIN_SIDE**2  # that a mask must leave: one window of SSIM
+BORDER = MIN_SIDE // 2  # pixels; what SSIM leaves out, where the window reaches outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,3 +55,13 @@ class TrainView:
     def counting(self, device: torch.device) -> Tensor | None:
         """Returns the mask, [H, W] bool."""
         return None if self.mask is None else torch.from_numpy(self.mask).to(device)
+
+
+def leaves_enough(mask: NDArray[np.bool_] | None) -> bool:
+    """Returns whether a mask [H, W] leaves MIN_PIXELS pixels off the border; None leaves all."""
+    return mask is None or int(np.count_nonzero(without_border(mask))) >= MIN_PIXELS
+
+
+def without_border(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Returns [H, W, ...] without the border that SSIM leaves out."""
+    return pixels[BORDER:-BORDER, BORDER:-BORDER]

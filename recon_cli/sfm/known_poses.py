@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.io.records import KnownPoses, read_poses
 from recon_cli.sfm import checks, database, features, mapper, matching, parts
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
 from recon_cli.sfm.merge_models import build_posed_model
 from recon_cli.sfm.verdict import check_weak_link, examine
+from recon_cli.workspace.records import KnownPoses, read_poses
 
 NEAREST = 20  # cameras that each one is matched with, as in `matching.similar_pairs`
 # Axes further apart share little: the wider side of a phone's picture spans 65 to 80 degrees.

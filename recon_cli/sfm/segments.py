@@ -25,9 +25,9 @@ from recon_cli.errors import (
     SfmError,
     WorkspaceError,
 )
-from recon_cli.executors.executor import Command, Executor
-from recon_cli.executors.shared_jobs import JobEnd, SharedJob, run_jobs
 from recon_cli.io.tracks import Tracks
+from recon_cli.jobs.executor import Command, Executor
+from recon_cli.jobs.shared_jobs import JobEnd, SharedJob, run_jobs
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.sfm.job import SPLIT, MappingJob, StepLog
 from recon_cli.sfm.keyframes import choose_keyframes

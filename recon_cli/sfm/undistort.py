@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
-from recon_cli.io.records import read_poses
+from recon_cli.room.scale import ScaleBetween
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.align_world import ScaleBetween, world_transform
+from recon_cli.sfm.align_world import world_transform
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
 from recon_cli.workspace import atomic
+from recon_cli.workspace.records import read_poses
 from recon_cli.workspace.summaries import WorldSummary
 
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"

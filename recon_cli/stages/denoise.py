@@ -16,9 +16,9 @@ import numpy as np
 from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.io import records as store
 from recon_cli.io.images import read_png, write_png
 from recon_cli.workspace import atomic
+from recon_cli.workspace import records as store
 from recon_cli.workspace.summaries import DenoiseSummary
 
 NOISE = "noise.json"

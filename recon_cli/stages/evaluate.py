@@ -29,16 +29,11 @@ from recon_cli.evaluation.metrics import (
     load_lpips,
 )
 from recon_cli.evaluation.reference_views import (
-    ReferenceView,
-    evenly_spread,
     load_held_out_views,
     load_reference_views,
-    load_scene,
     mean_psnr,
     reference_digest,
     score_views,
-    size_summary,
-    sizes_of,
 )
 from recon_cli.evaluation.scores import (
     REFERENCE,
@@ -50,13 +45,15 @@ from recon_cli.evaluation.scores import (
     view_table,
 )
 from recon_cli.io.images import to_uint8, write_png
-from recon_cli.io.ply import read_ply
-from recon_cli.io.records import Frame, ImportRecord, describe_stretches, read_frame_list
+from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import ReferenceView, evenly_spread, size_summary, sizes_of
 from recon_cli.scene.scene import Scene
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.assess import TrustTask, assess
 from recon_cli.workspace.atomic import write_json, write_text
+from recon_cli.workspace.records import Frame, ImportRecord, describe_stretches, read_frame_list
 from recon_cli.workspace.summaries import EvaluateSummary, WorldSummary
 
 _GAIN = 4  # of the difference images
@@ -179,7 +176,7 @@ def run(
 
 def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> _Evaluation:
     train_config = read_config(inputs.folders["train"])
-    scene = load_scene(inputs, validation=train_config.validation)
+    scene = load_scene(inputs.folders, validation=train_config.validation)
     size = config.max_size or train_config.max_size
     held_out = load_held_out_views(scene, size, ctx)
     splits = {"training": scene.train, "validation": scene.validation}

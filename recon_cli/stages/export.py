@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import MESH_FORMATS, PLAN, ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconError, StageError, WorkspaceError
-from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.export.bounds import describe_bounds
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
 from recon_cli.export.exporter import Exporter
@@ -30,9 +29,9 @@ from recon_cli.export.kept_files import (
     read_records,
 )
 from recon_cli.export.verify import verify_ply
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
+from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.splats import Splats, transformed
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.ply_property import PLY_PROPERTY, expected_errors, match_rows
 from recon_cli.trust.scene_trust import measure_trust, refuse_without, views_looked_at
@@ -43,6 +42,7 @@ from recon_cli.workspace.export_record import (
     FailedFormat,
     limited_format,
 )
+from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
 
 TRANSFORM = "transform.json"
 _VIEW_FORMATS = ("colmap", "transforms.json", *MESH_FORMATS)  # made of views
@@ -132,7 +132,7 @@ def _expected_errors(
         return {}
     refuse_without(ImportRecord.read(inputs.folders["train"]))
     run_config = read_config(inputs.folders["train"])
-    scene = load_scene(inputs, validation=run_config.validation)
+    scene = load_scene(inputs.folders, validation=run_config.validation)
     with ctx.progress.bar("trust", views_looked_at(scene), unit="view") as bar:
         errors = expected_errors(trained, measure_trust(
             trained.map(lambda tensor: tensor.to(ctx.device)), scene, run_config,

@@ -14,17 +14,17 @@ import numpy as np
 from recon_cli.config.stages import MIN_GAUSSIANS, ImportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, InputError
-from recon_cli.evaluation.reference_views import load_scene as load_views_of
 from recon_cli.export.import_alignment import Alignment, align_to_views, read_world
-from recon_cli.io.ply import write_ply
-from recon_cli.io.records import ImportRecord
-from recon_cli.io.splats.axes import AXES
-from recon_cli.io.splats.loaded import LoadedScene
-from recon_cli.io.splats.registry import format_of, load_scene
+from recon_cli.io.training_scene import load_scene as load_views_of
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
+from recon_cli.splats.axes import AXES
+from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.ply import write_ply
+from recon_cli.splats.registry import format_of, load_scene
 from recon_cli.train.train_data import write_config
 from recon_cli.workspace.digests import digest_file
+from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import ImportSummary
 
 
@@ -74,7 +74,7 @@ def _align(
     """
     if not {"ingest", "sfm"} <= inputs.folders.keys():
         return None
-    scene = load_views_of(inputs, validation=config.validation)
+    scene = load_views_of(inputs.folders, validation=config.validation)
     return align_to_views(
         splats, scene, read_world(inputs.folders["sfm"]), config.frame, config.max_size, ctx,
         moved=moved)

@@ -6,19 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from recon_cli.capture import from_data_set, from_photos, from_video
+from recon_cli.capture import from_photos, from_video
 from recon_cli.capture.archives import refuse_other_file
+from recon_cli.capture.foreign import FOREIGN, find_foreign
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import IngestedSource, merge_sources
 from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.datasets import from_data_set
+from recon_cli.datasets.layouts import recognise, refuse_incomplete
 from recon_cli.errors import InputError
-from recon_cli.io import records as store
-from recon_cli.io.foreign import FOREIGN, find_foreign
-from recon_cli.io.layouts import recognise, refuse_incomplete
-from recon_cli.io.records import FrameList
 from recon_cli.io.tracks import TRACKS
 from recon_cli.sfm.segments import MOST_WHOLE
+from recon_cli.workspace import records as store
+from recon_cli.workspace.records import FrameList
 from recon_cli.workspace.summaries import IngestSummary
 
 MIN_TRAINED = 2  # one view holds no depth

@@ -11,8 +11,8 @@ from pathlib import Path
 from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, TrainingError
-from recon_cli.io.ply import max_gaussians, write_ply
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import max_gaussians, write_ply
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.prune_loop import RATIO, prune_loop, remaining
 from recon_cli.train.prune_run import StoredPruneRun, load_prune_source, prune_while_good

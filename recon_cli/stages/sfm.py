@@ -12,14 +12,14 @@ from typing import Any
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, list_names
-from recon_cli.executors.executor import Executor, start_executor
-from recon_cli.io import records as store
-from recon_cli.io.records import POSES, FrameList, describe_stretches, read_poses
 from recon_cli.io.tracks import TRACKS, Tracks
+from recon_cli.jobs.executor import Executor, start_executor
+from recon_cli.room.scale import parse_place
 from recon_cli.sfm import database, parts, process, segments
-from recon_cli.sfm.align_world import parse_place
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
 from recon_cli.sfm.time_estimate import Workload, format_minutes, tell_seconds
+from recon_cli.workspace import records as store
+from recon_cli.workspace.records import POSES, FrameList, describe_stretches, read_poses
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.

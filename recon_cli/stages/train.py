@@ -13,7 +13,7 @@ from pathlib import Path
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.scene import Scene
 from recon_cli.train import blocks
 from recon_cli.train.finished_model import FinishedModel
@@ -24,7 +24,7 @@ from recon_cli.workspace.summaries import TrainSummary
 
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
     """Fits Gaussians to the training views and returns how far it came."""
-    scene = load_scene(inputs, validation=config.validation)
+    scene = load_scene(inputs.folders, validation=config.validation)
     model = None if inputs.continues is None else FinishedModel.read(inputs.continues)
     count = _count_blocks(config, scene, model, ctx)
     if count > 1:

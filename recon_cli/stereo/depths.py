@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.render.numba.thread_pool import pool
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo.kernels import compare, lay_planes, match

@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from recon_cli.render.numba.kernel import inlined, kernel
-from recon_cli.render.numba.simd_functions import fetch_add
+from recon_cli.kernels.kernel import inlined, kernel
+from recon_cli.kernels.simd_functions import fetch_add
 
 # Chosen on the room "living" and checked on "office" (docs/mesh.md); all are flat around:
 _NOISE = np.float32(2.0)  # squared grey levels added to variances: blank windows correlate little

@@ -25,10 +25,10 @@ from recon_cli import machine
 from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, ManifestError, ReconstructionError
-from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.executors.executor import CORES, NEEDS_GPU, Command, Executor, start_executor
-from recon_cli.executors.shared_jobs import SharedJob, describe_failures, run_jobs
 from recon_cli.io.colmap import read_observations, write_part
+from recon_cli.io.training_scene import load_scene
+from recon_cli.jobs.executor import CORES, NEEDS_GPU, Command, Executor, start_executor
+from recon_cli.jobs.shared_jobs import SharedJob, describe_failures, run_jobs
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.covisibility import (
     context_points,
@@ -158,7 +158,7 @@ class BlockJob:
         write_part(
             self.inputs.folders["sfm"] / "undistorted" / "sparse", part, self.views,
             context_points(self.cell.owned, self.config.seed))
-        scene = load_scene(self.inputs, validation=self.validation, sparse=part)
+        scene = load_scene(self.inputs.folders, validation=self.validation, sparse=part)
         return dataclasses.replace(scene, cell=self.cell)
 
 

@@ -17,9 +17,8 @@ from typing import Any
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
-from recon_cli.io.ply import read_ply
-from recon_cli.io.records import ImportRecord
 from recon_cli.scene.splats import with_rows
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.feature_trials import PARTS, model_parts
 from recon_cli.train.initialize import begin_state, restore_state
 from recon_cli.train.runner import LOG
@@ -28,6 +27,7 @@ from recon_cli.train.state import DensificationStats, TrainState, read_progress
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import LogRow, TrainPlan, TrialDecision
 
 FINAL = "final.safetensors"

@@ -14,15 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.lazy import load
 from recon_cli.render import Statistics, render
 from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.optimizer import SplatOptimizer
 
 if TYPE_CHECKING:
-    from recon_cli.render.numba.step import PhotometricStep as NumbaStep
-    from recon_cli.render.triton.step import PhotometricStep as TritonStep
     from recon_cli.render.triton.step_status import StepReport, StepStatus
 
 # of SSIM in the loss, as in the reference: 11 taps
@@ -79,7 +76,9 @@ class _FusedStep:
     """The numba backend's own loss and gradients, in buffers that are used again."""
 
     def __init__(self) -> None:
-        self._compute: NumbaStep = load("recon_cli.render.numba.step.PhotometricStep")()
+        from recon_cli.render.numba.step import PhotometricStep
+
+        self._compute = PhotometricStep()
 
     @property
     def log_gain_gradient(self) -> NDArray[np.float64]:
@@ -99,7 +98,9 @@ class _DeviceStep:
     """The triton backend's own loss and gradients; nothing but `close` waits for the device."""
 
     def __init__(self, device: torch.device) -> None:
-        self._compute: TritonStep = load("recon_cli.render.triton.step.PhotometricStep")(device)
+        from recon_cli.render.triton.step import PhotometricStep
+
+        self._compute = PhotometricStep(device)
         self.log_gain_gradient = np.zeros(3)
 
     @property

@@ -20,12 +20,13 @@ from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, ReconstructionError
 from recon_cli.evaluation.metrics import psnr
-from recon_cli.evaluation.reference_views import load_reference_views, render_view, size_summary
+from recon_cli.evaluation.reference_views import load_reference_views, render_view
 from recon_cli.io.images import fit_camera
-from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.io.views import size_summary
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats, joined
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.train.blocks import MERGE_SHARE, BlockJob, record
 from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.initialize import begin_state, restore_state

@@ -8,10 +8,9 @@ import torch
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext
-from recon_cli.evaluation.reference_views import size_summary
-from recon_cli.io.ply import write_ply
-from recon_cli.io.records import ImportRecord
+from recon_cli.io.views import size_summary
 from recon_cli.scene.scene import Scene
+from recon_cli.splats.ply import write_ply
 from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.plan import first_or_saved, plan_task
@@ -19,6 +18,7 @@ from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import delete
+from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
 
 

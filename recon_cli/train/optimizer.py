@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.lazy import load
 from recon_cli.scene.splats import Splats, with_terms
 from recon_cli.train.schedule import RECIPES
 
@@ -152,13 +151,17 @@ class SplatOptimizer:
         self._rates["means"] = means_rate * self._means_unit / factor
         names = self._names(sh_rest=sh_rest)
         if self._backend == "triton":
-            load("recon_cli.render.triton.optimizer.step")(
+            from recon_cli.render.triton import optimizer as triton_optimizer
+
+            triton_optimizer.step(
                 *self._groups(names), taken=self._taken, counted=counted, betas=self._betas,
                 epsilon=_EPSILON)
             return
         self._taken += 1
         if self.fused:
-            load("recon_cli.render.numba.optimizer.step")(
+            from recon_cli.render.numba import optimizer as numba_optimizer
+
+            numba_optimizer.step(
                 *self._groups(names), count=self.count, betas=self._betas, epsilon=_EPSILON)
         else:
             self._step_torch(names)

@@ -20,9 +20,8 @@ from torch import Tensor
 from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
-from recon_cli.evaluation.reference_views import load_scene
-from recon_cli.io.ply import read_ply
-from recon_cli.io.records import ImportRecord
+from recon_cli.io.training_scene import load_scene
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import make_finished_state, restore_state
@@ -33,6 +32,7 @@ from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task, read_config
 from recon_cli.workspace.atomic import delete, read_json, write_bytes
+from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import JsonRecord, TrainPlan
 
 logger = logging.getLogger("recon")
@@ -100,7 +100,7 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
                    "model is pruned.")
         config = dataclasses.replace(config, at="end")
     train_config = read_config(train)
-    scene = load_scene(inputs, validation=train_config.validation)
+    scene = load_scene(inputs.folders, validation=train_config.validation)
     task = load_task(scene, train_config, ctx)
     path = train / "mid.safetensors" if config.at == "mid" else final
 

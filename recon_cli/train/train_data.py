@@ -15,7 +15,7 @@ import torch
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, TrainingError
-from recon_cli.evaluation import reference_views
+from recon_cli.io import views as view_files
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
 from recon_cli.machine import free_memory_bytes
@@ -59,7 +59,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     if len(train) < 2:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
-            hint=reference_views.MASK_HINT)
+            hint=view_files.MASK_HINT)
     if ctx.device == "cuda":
         train = [view.page_locked() for view in train]
     nearness = scene.nearness if len(scene.points) else None
@@ -89,10 +89,10 @@ def _refuse_tiny_units(scene: Scene) -> None:
 
 def load_views(
     views: Sequence[View], config: RunConfig, ctx: StageContext, file: ImageFile | None = None
-) -> list[reference_views.ReferenceView]:
+) -> list[view_files.ReferenceView]:
     """Returns the views at the training size, without those whose mask leaves next to nothing."""
-    return [*reference_views.load_views(
-        views, config.max_size, "not trained on", ctx, denoised=config.images == "denoised",
+    return [*view_files.load_views(
+        views, config.max_size, "not trained on", ctx.notice, denoised=config.images == "denoised",
         threads=ctx.threads, file=file)]
 
 
@@ -224,7 +224,7 @@ def _memory(
     scene: Scene, config: RunConfig, ctx: StageContext, *, gaussians: int
 ) -> MemoryEstimate:
     views = (*scene.train, *scene.validation)
-    width, height = reference_views.sizes_of(
+    width, height = view_files.sizes_of(
         [fit_camera(view.camera, config.max_size) for view in views])[0]
     return estimate_memory(
         views=len(views), width=width, height=height, gaussians=gaussians,

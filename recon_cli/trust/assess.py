@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.evaluation.reference_views import ReferenceView, evenly_spread
 from recon_cli.io.images import write_png
-from recon_cli.io.ply import read_ply
-from recon_cli.io.records import ImportRecord
+from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
+from recon_cli.splats.ply import read_ply
 from recon_cli.trust.heat_map import heat_colors
 from recon_cli.trust.poorly_seen import find_poorly_seen
 from recon_cli.trust.scene_trust import (
@@ -28,6 +27,7 @@ from recon_cli.trust.scene_trust import (
 )
 from recon_cli.trust.support import MAX_VIEWS
 from recon_cli.trust.surface import find_cells, surface_shares
+from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import WorldSummary
 
 

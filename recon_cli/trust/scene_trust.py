@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ManifestError, StageError
-from recon_cli.evaluation.reference_views import ReferenceView, evenly_spread, load_reference_views
-from recon_cli.io.records import NEEDS_VIEWS_HINT, ImportRecord
+from recon_cli.evaluation.reference_views import load_reference_views
+from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
@@ -26,6 +26,7 @@ from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.support import MAX_VIEWS, Support, error_image, measure_support
 from recon_cli.trust.surface import SurfaceShares
 from recon_cli.workspace.atomic import read_json, write_json
+from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord
 from recon_cli.workspace.summaries import JsonRecord
 
 FOLDER = "trust"  # in that of evaluate

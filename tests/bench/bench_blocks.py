@@ -21,14 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import (
-    ReferenceView,
-    load_reference_views,
-    load_scene,
-    score_views,
-)
-from recon_cli.io.ply import read_ply
+from recon_cli.evaluation.reference_views import load_reference_views, score_views
+from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import ReferenceView
 from recon_cli.scene.cells import Cell
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.blocks import cut_blocks
 from recon_cli.train.train_data import read_config
 
@@ -109,7 +106,7 @@ def main(
     ctx = StageContext(backend="numba")
     folders = {name: workspace / name for name in ("ingest", "denoise", "sfm")}
     config, inputs = read_config(parts.workspace / "train"), StageInputs(folders)
-    scene = load_scene(inputs, validation=config.validation)
+    scene = load_scene(inputs.folders, validation=config.validation)
     views = load_reference_views(scene.test, max_size, ctx)
     cells = [job.cell for job in cut_blocks(config, blocks, scene, inputs, out / "cut")]
     border = np.array([near_border(cells, view.camera.center, near) for view in views])

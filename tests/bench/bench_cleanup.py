@@ -17,17 +17,17 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.context import StageContext
 from recon_cli.export.cleanup import count_sightings, find_floaters, find_islands
 from recon_cli.export.verify import load_reference_psnr
-from recon_cli.io.ply import read_ply
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render import render
 from recon_cli.render.registry import resolve
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, Splats, joined
 from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.train_data import load_views, read_config
 
 PLANTED = 60
@@ -82,7 +82,7 @@ def main(workspaces: tuple[Path, ...]) -> None:
     ctx = StageContext(backend=backend, device=device)
     for root in workspaces:
         config, draw = read_config(root / "train"), np.random.default_rng(0)
-        scene = load_scene(StageInputs({name: root / name for name in ("ingest", "sfm")}),
+        scene = load_scene({name: root / name for name in ("ingest", "sfm")},
                            validation=config.validation)
         views, held = load_views(scene.train, config, ctx), load_reference_psnr(
             scene, Similarity(), config.max_size, ctx)

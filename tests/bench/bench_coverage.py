@@ -19,12 +19,13 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_reference_views, load_scene
-from recon_cli.io.ply import read_ply
+from recon_cli.evaluation.reference_views import load_reference_views
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.train_data import read_config
 
 CLASSES = (0, 1, 3, 10, 1000)  # views that show a pixel: 0, 1 to 2, 3 to 9, 10 and more
@@ -77,7 +78,7 @@ def main(workspace: Path) -> None:
     """Print shares of pixels and of squared error, and PSNR, by how many views show a pixel."""
     inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm", "train")})
     config = read_config(workspace / "train")
-    scene = load_scene(inputs, validation=config.validation)
+    scene = load_scene(inputs.folders, validation=config.validation)
     splats, ctx = read_ply(workspace / "train" / "splats.ply"), StageContext(backend="numba")
     train = load_reference_views(scene.train, config.max_size, ctx)
     cameras = [view.camera for view in train]

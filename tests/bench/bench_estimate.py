@@ -23,7 +23,7 @@ import numpy as np
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render import registry
 from recon_cli.train import plan
 from recon_cli.train.cost import CostModel, calibrate
@@ -42,7 +42,7 @@ def row(workspace: Path, config: TrainConfig, ctx: StageContext, clock: str) -> 
     """Plans and runs one training and returns its line of the table."""
     now = CLOCKS[clock]
     inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
-    scene = load_scene(inputs, validation=config.validation)
+    scene = load_scene(inputs.folders, validation=config.validation)
     first = plan.first_config(config)
     task = load_task(scene, first, ctx)
     facts = plan.Facts(plan.count_detail(task.train), len(task.train), len(scene.points),

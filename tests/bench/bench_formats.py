@@ -12,8 +12,8 @@ from pathlib import Path
 
 import click
 
-from recon_cli.io.splats.registry import FORMATS, read_splats
 from recon_cli.render.registry import use_threads
+from recon_cli.splats.registry import FORMATS, read_splats
 
 
 @click.command()

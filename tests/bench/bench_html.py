@@ -26,10 +26,10 @@ from browser import WatchedPage, launch_browser, watch_page
 from numpy.typing import NDArray
 from PIL import Image
 
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.splats.html import write_html
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
+from recon_cli.splats.html import write_html
+from recon_cli.splats.ply import read_ply, write_ply
 
 SIDE = 600  # pixels of the longer side
 WALK_FRAMES, WALK_SECONDS = 20, 40  # whichever is reached first

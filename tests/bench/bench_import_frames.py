@@ -13,12 +13,12 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.context import StageContext
 from recon_cli.export.import_alignment import SOURCE, align_to_views
-from recon_cli.io.ply import read_ply
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render.registry import resolve
 from recon_cli.scene.similarity import Similarity
+from recon_cli.splats.ply import read_ply
 
 MOVES = [  # degrees, extents, scale
     (0, 0, 1), (1, 0, 1), (3, 0, 1), (10, 0, 1), (45, 0, 1), (0, 0.05, 1), (0, 0.2, 1),
@@ -33,7 +33,7 @@ def main(workspaces: tuple[Path, ...]) -> None:
     ctx = StageContext(backend=backend, device=device)
     for root in workspaces:
         scene = load_scene(
-            StageInputs({name: root / name for name in ("ingest", "sfm")}), validation=0.05)
+            {name: root / name for name in ("ingest", "sfm")}, validation=0.05)
         splats = read_ply(root / "train" / "splats.ply")
         middle = scene.points.mean(axis=0)
         for degrees, extents, scale in MOVES:

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import click
 
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.splats.compressed_ply import read_compressed_ply, write_compressed_ply
-from recon_cli.io.splats.splat import read_splat, write_splat
-from recon_cli.io.splats.spz import read_spz, write_spz
 from recon_cli.scene.splats import Splats, with_rows
+from recon_cli.splats.compressed_ply import read_compressed_ply, write_compressed_ply
+from recon_cli.splats.ply import read_ply, write_ply
+from recon_cli.splats.splat import read_splat, write_splat
+from recon_cli.splats.spz import read_spz, write_spz
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from splat_cases import edge_splats, greatest, rotation_error

@@ -24,13 +24,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.splats.glb import read_glb, write_glb
-from recon_cli.io.splats.lod import make_levels, read_lod, write_lod
-from recon_cli.io.splats.sog import Unpacked, read_files, read_sog, write_sog
 from recon_cli.render.registry import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.glb import read_glb, write_glb
+from recon_cli.splats.lod import make_levels, read_lod, write_lod
+from recon_cli.splats.ply import read_ply, write_ply
+from recon_cli.splats.sog import Unpacked, read_files, read_sog, write_sog
 
 # From the axes that splat-transform takes a .ply for to those of glTF: half a turn about z.
 THEIR_AXES: NDArray[np.float64] = np.diag([-1.0, -1, 1])

@@ -18,14 +18,13 @@ import click
 import cv2
 import torch
 
-from recon_cli.context import StageInputs
-from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.io.images import fit_camera
-from recon_cli.io.ply import read_ply
-from recon_cli.io.splats.lod import make_levels, write_lod
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.lod import make_levels, write_lod
+from recon_cli.splats.ply import read_ply
 
 SIZES = (1, 2, 4, 8)
 VIEWS, SIDE = 8, 600
@@ -55,7 +54,7 @@ def main(workspace: Path) -> None:
     """Print Gaussians, megabytes and agreement of each level."""
     splats = read_ply(workspace / "train" / "splats.ply")
     scene = load_scene(
-        StageInputs({name: workspace / name for name in ("ingest", "sfm")}), validation=0.0)
+        {name: workspace / name for name in ("ingest", "sfm")}, validation=0.0)
     cameras = [fit_camera(view.camera, SIDE)
                for view in scene.train[:: max(1, len(scene.train) // VIEWS)]]
     views = [(camera, image(splats, camera)) for camera in cameras]

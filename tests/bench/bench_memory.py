@@ -21,7 +21,7 @@ import cv2
 from recon_cli import machine
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.stages import train
@@ -67,7 +67,7 @@ def main(
         return
     use_threads("numba", 2)
     inputs = StageInputs({name: workspace / name for name in ("ingest", "denoise", "sfm")})
-    scene = enlarged(load_scene(inputs, validation=0.05), views, width, child)
+    scene = enlarged(load_scene(inputs.folders, validation=0.05), views, width, child)
     config = TrainConfig(
         iterations=iterations, max_size=width, max_gaussians=max_gaussians)
     ctx = StageContext(backend="numba", threads=2, max_memory_bytes=int(max_memory * 1e9),

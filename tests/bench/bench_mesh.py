@@ -25,17 +25,18 @@ from numpy.typing import NDArray
 from pose_errors import similarity
 from scipy.spatial import cKDTree
 
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene, load_views
-from recon_cli.export.mesh import build
-from recon_cli.export.mesh.depth_maps import DepthMaps, render_depth_maps, weigh, weigh_by_agreement
-from recon_cli.export.mesh.volume import extract, fuse, pixel_rays
-from recon_cli.io.ply import read_ply
+from recon_cli.context import StageContext
+from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import load_views
 from recon_cli.progress import NullProgress
 from recon_cli.render.registry import use_threads
+from recon_cli.room import mesh as build
+from recon_cli.room.depth_maps import DepthMaps, render_depth_maps, weigh, weigh_by_agreement
+from recon_cli.room.volume import extract, fuse, pixel_rays
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.ply import read_ply
 
 ROOMS = Path(__file__).resolve().parents[3] / "shared" / "data" / "rooms"
 SPACING, DENSE = 0.03, 0.01  # metres
@@ -158,7 +159,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
     """Prints the table."""
     use_threads("numba", threads)
     folders = {name: workspace / name for name in ("ingest", "sfm", "train")}
-    scene = load_scene(StageInputs(folders), validation=0.05)
+    scene = load_scene(folders, validation=0.05)
     splats = read_ply(workspace / "train" / "splats.ply")
     ctx = StageContext(NullProgress(), "cpu", "numba", threads)
     true, moved = true_scene(scene, ROOMS / room) if video else (scene, lambda places: places)

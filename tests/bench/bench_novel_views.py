@@ -20,9 +20,9 @@ from pose_errors import similarity
 from recon_cli.evaluation.metrics import psnr, ssim
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import fit_camera, read_image
-from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.train_data import read_config
 
 FOCAL, WIDTH, HEIGHT = 300.0, 600, 340  # pixels, with the principal point at the centre

@@ -27,9 +27,10 @@ import numpy as np
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_reference_views, load_scene
+from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.runner import score_as_ply
 from recon_cli.io.colmap import read_visibility
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene
@@ -161,7 +162,7 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
                "|---|---|---:|---:|---:|---:|---:|")
     for workspace in workspaces:
         inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
-        scene = load_scene(inputs, validation=base.validation)
+        scene = load_scene(inputs.folders, validation=base.validation)
         if stretches:
             scene, sparse = without_stretches(scene)
         task = load_task(scene, base, ctx)

@@ -22,12 +22,12 @@ import cv2
 from recon_cli.evaluation.metrics import CONVENTIONS
 from recon_cli.evaluation.scores import Metrics, ModelMetrics, Table, ViewScore
 from recon_cli.io.images import read_png, write_png
-from recon_cli.io.records import FOLDER
 from recon_cli.pipeline.execute import Job
 from recon_cli.report.build import write_report
 from recon_cli.report.gallery import MAX_FILE_BYTES, build_gallery
 from recon_cli.report.records import MODELS
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.records import FOLDER
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from browser import launch_browser, watch_page

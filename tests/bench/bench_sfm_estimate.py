@@ -24,10 +24,10 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from recon_cli.errors import FormatError, ManifestError
-from recon_cli.io.records import read_frame_list
 from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.sfm.keyframes import choose_keyframes
 from recon_cli.sfm.time_estimate import COSTS, Costs, Workload, expected_seconds, list_work
+from recon_cli.workspace.records import read_frame_list
 from recon_cli.workspace.summaries import SfmSummary
 
 HEADINGS = (

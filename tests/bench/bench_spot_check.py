@@ -14,9 +14,9 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.io.records import FOLDER, POSES, read_frame_list, read_poses
 from recon_cli.sfm import known_poses
 from recon_cli.sfm.job import CameraGroup, MappingJob
+from recon_cli.workspace.records import FOLDER, POSES, read_frame_list, read_poses
 
 Poses = dict[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import click
 
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.context import StageContext
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render.registry import use_threads
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import restore_state
@@ -35,7 +35,7 @@ def main(workspace: Path, threads: int) -> None:
     use_threads("numba", threads)
     ctx = StageContext(backend="numba", threads=threads)
     scene = load_scene(
-        StageInputs({name: workspace / name for name in ("ingest", "sfm")}), validation=0.05)
+        {name: workspace / name for name in ("ingest", "sfm")}, validation=0.05)
     config = dataclasses.replace(
         read_config(workspace / "train"), iterations=_LENGTH, densify_every=2 * _LENGTH,
         early_stop=False, means_rate=0.0, quats_rate=0.0, scales_rate=0.0, opacities_rate=0.0,

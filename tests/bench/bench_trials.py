@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.metrics import corrected_psnr, psnr
-from recon_cli.evaluation.reference_views import load_scene, render_view
+from recon_cli.evaluation.reference_views import render_view
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.exposure import estimate_gains
@@ -53,7 +54,7 @@ class Capture:
     ) -> None:
         self.name, self.asked, self.ctx = workspace.name, asked, ctx
         inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
-        self.scene: Scene = load_scene(inputs, validation=VALIDATION)
+        self.scene: Scene = load_scene(inputs.folders, validation=VALIDATION)
         self.task: Task = load_task(self.scene, first_config(asked), ctx)
         self.needs = choose_parts(self.task, self.scene, ctx, harmonics=True)
         self._scores: dict[RunConfig, NDArray[np.float64]] = {}

@@ -21,10 +21,12 @@ import cv2
 import numpy as np
 
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import ReferenceView, load_reference_views, load_scene
-from recon_cli.io.ply import read_ply
+from recon_cli.evaluation.reference_views import load_reference_views
+from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import ReferenceView
 from recon_cli.machine import usable_threads
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.agreement import ause
@@ -59,7 +61,7 @@ def main(workspaces: Sequence[Path]) -> None:
     for workspace in workspaces:
         inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm", "train")})
         config = read_config(workspace / "train")
-        scene = load_scene(inputs, validation=config.validation)
+        scene = load_scene(inputs.folders, validation=config.validation)
         splats = read_ply(workspace / "train" / "splats.ply")
         ctx = StageContext(backend="numba", threads=usable_threads())
         start = process_time()

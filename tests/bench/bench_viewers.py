@@ -15,13 +15,14 @@ from pathlib import Path
 import click
 import torch
 
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_reference_views, load_scene
+from recon_cli.context import StageContext
+from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.runner import score_as_ply
-from recon_cli.io.ply import read_ply
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import read_ply
 from recon_cli.train.train_data import read_config
 
 LIMITS = (2.0, 1.4, 1.2)  # times the window
@@ -50,7 +51,7 @@ def main(workspaces: tuple[Path, ...], threads: int) -> None:
                "|---|---:|---:|---:|" + "---:|" * len(LIMITS))
     for workspace in workspaces:
         scene = load_scene(
-            StageInputs({name: workspace / name for name in ("ingest", "sfm")}), validation=0)
+            {name: workspace / name for name in ("ingest", "sfm")}, validation=0)
         config = read_config(workspace / "train")
         splats = read_ply(workspace / "train" / "splats.ply")
         views = load_reference_views(scene.test, config.max_size, ctx)

@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.io.training_scene import load_scene
 from recon_cli.machine import usable_threads
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene, View
@@ -69,7 +69,7 @@ class Capture:
 def open_capture(workspace: Path, max_size: int, iterations: int) -> Capture:
     """Returns the capture of a workspace without its middle third."""
     inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
-    scene = load_scene(inputs, validation=0.05)
+    scene = load_scene(inputs.folders, validation=0.05)
     every, third = scene.train, len(scene.train) // 3
     stretch = every[third:2 * third]
     names = {view.name for view in stretch}

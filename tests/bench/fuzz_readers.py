@@ -26,8 +26,8 @@ import torch
 from splat_cases import damaged, edge_splats
 
 from recon_cli.errors import ReconError
-from recon_cli.io.splats.registry import FORMATS, read_splats
-from recon_cli.io.splats.spz import write_spz
+from recon_cli.splats.registry import FORMATS, read_splats
+from recon_cli.splats.spz import write_spz
 
 _MOST_BYTES = 2 << 30  # beyond what is taken before the first file
 _MOST_SECONDS = 10.0

@@ -30,12 +30,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from recon_cli.flythrough.output import VideoEncoding, encode_video
 from recon_cli.io.colmap import read_images
-from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.progress import TqdmProgress
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, Splats, joined, quaternion, transformed
+from recon_cli.splats.ply import read_ply, write_ply
 
 Array = NDArray[np.float64]
 

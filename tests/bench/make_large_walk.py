@@ -16,9 +16,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from recon_cli.io.colmap import read_cameras, read_images
-from recon_cli.io.ply import read_ply
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
+from recon_cli.splats.ply import read_ply
 
 NOISE = 2.0  # 1/255, as a phone's frames by daylight
 QUALITY = 92  # of JPEG

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from recon_cli.datasets.layouts import read_posed
 from recon_cli.io.colmap import read_images
-from recon_cli.io.layouts import read_posed
 
 Poses = Mapping[str, NDArray[np.float64]]  # [4, 4] camera to world by name
 

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import IngestConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.io import records
 from recon_cli.progress import NullProgress
 from recon_cli.sfm import features, mapper, matching
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, Reporter
 from recon_cli.stages import ingest
+from recon_cli.workspace import records
 
 FEATURES = 2000  # of an image; two thirds of the default take half of the time
 MODEL = "model.done"  # in a capture's folder

@@ -8,8 +8,9 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from recon_cli.evaluation.metrics import leaves_enough, load_lpips, psnr, ssim
+from recon_cli.evaluation.metrics import load_lpips, psnr, ssim
 from recon_cli.io.images import to_uint8
+from recon_cli.scene.train_view import leaves_enough
 from recon_cli.train.gradient import photometric_loss
 
 pytestmark = pytest.mark.floors

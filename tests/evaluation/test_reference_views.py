@@ -3,7 +3,8 @@
 import numpy as np
 import torch
 
-from recon_cli.evaluation.reference_views import ReferenceView, mean_psnr, score_views
+from recon_cli.evaluation.reference_views import mean_psnr, score_views
+from recon_cli.io.views import ReferenceView
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 

@@ -23,8 +23,8 @@ from recon_cli.experiments.bench_scene import (
     variants_for,
 )
 from recon_cli.experiments.instruments import Probe
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import registry
-from recon_cli.render.numba.thread_pool import pool
 from recon_cli.render.torch import tiles
 
 Said = pytest.CaptureFixture[str]

@@ -16,8 +16,8 @@ from recon_cli.cli import main
 from recon_cli.context import EarlierResult
 from recon_cli.export import exporter
 from recon_cli.export.kept_files import keep_files
-from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.workspace.export_record import ExportedFile
 from recon_cli.workspace.layout import Workspace
 

@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import fcntl
 import gc
+import importlib
 import os
 import resource
 import runpy
@@ -26,13 +27,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import cv2
 import psutil
 import pycolmap  # noqa: F401 - the mapping process is forked, too
 import torch
 
 from recon_cli import cli
-from recon_cli.lazy import load
+from recon_cli.render import registry
 from recon_cli.stages import IMPORT, STAGES
 
 MEMORY_BYTES = 16 << 30  # of address space: what a hostile input asks for must not stop the machine
@@ -66,16 +68,14 @@ def preload() -> None:
 
     What imports this module has set OMP_NUM_THREADS=1 before.
     """
-    for place, _ in cli.VERBS.values():
-        load(f"recon_cli.commands.{place}")
-    for row in (*STAGES, IMPORT):
-        load(f"{row.module}.run")
-    for late in ("recon_cli.flythrough.run.render_frames", "recon_cli.report.build.write_report",
-                 "recon_cli.io.splats.registry.FORMATS"):
-        load(late)
+    for verb in cli.VERBS:
+        cli.cli.get_command(click.Context(cli.cli), verb)
+    late = ("recon_cli.flythrough.run", "recon_cli.report.build", "recon_cli.splats.registry")
+    for module in (*(row.module for row in (*STAGES, IMPORT)), *late):
+        importlib.import_module(module)
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    load("recon_cli.render.registry.prepare")("numba", lambda: None)
+    registry.prepare("numba", lambda: None)
     gc.freeze()  # else each child copies every page that its first collection marks
 
 
@@ -191,7 +191,8 @@ def _run_entry_point(words: Sequence[str]) -> int:
     """Runs what the script `recon` runs, and returns the exit code."""
     sys.argv = ["recon", *words]
     try:
-        return _exit_code(load(SCRIPT.replace(":", "."))())
+        module, _, name = SCRIPT.partition(":")
+        return _exit_code(getattr(importlib.import_module(module), name)())
     except SystemExit as end:
         return _exit_code(end.code)
 

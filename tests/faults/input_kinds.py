@@ -21,7 +21,7 @@ from PIL import Image
 from workspace_kinds import classes
 
 from recon_cli.errors import ReconError
-from recon_cli.io.ply import read_ply
+from recon_cli.splats.ply import read_ply
 
 _COMMON = ("--max-size", "256", "--frames", "8")
 _SUFFIXES = (".mov", ".mkv", ".jpg", ".png", ".txt", ".zip", ".json", ".ply", "", ".MP4", ".r3d",

@@ -12,10 +12,10 @@ import torch
 from tiny_scene import make_inputs
 
 from recon_cli.config.stages import ComputeConfig, RunConfig
-from recon_cli.io.ply import write_ply
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import write_ply
 from recon_cli.stages import STAGES
 from recon_cli.train.train_data import write_config
 from recon_cli.workspace.layout import Workspace

@@ -7,8 +7,8 @@ from render_cli import pictures, record, render
 
 from recon_cli.cli import main
 from recon_cli.flythrough import model_trust
-from recon_cli.io.records import ImportRecord
 from recon_cli.trust.heat_map import INVENTED, TRUSTED, error_steps, heat_colors, tint
+from recon_cli.workspace.records import ImportRecord
 
 
 def test_trust_is_a_16_bit_picture_and_its_colours(room, tmp_path):

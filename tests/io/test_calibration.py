@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon_cli.errors import FormatError
-from recon_cli.io.calibration import lens_from_matrix, make_lens, viewmat_from_pose
+from recon_cli.io.calibration import lens_from_matrix, viewmat_from_pose
+from recon_cli.scene.camera import make_lens
 
 POSE = np.array([[0, 0, 1, 2], [1, 0, 0, 3], [0, 1, 0, 4], [0, 0, 0, 1.0]])
 

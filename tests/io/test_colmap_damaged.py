@@ -11,8 +11,8 @@ from colmap_sets import (
     write_old,
 )
 
+from recon_cli.datasets.colmap import read_colmap
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.colmap_set import read_colmap
 
 
 @pytest.fixture(params=FORMS)

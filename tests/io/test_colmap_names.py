@@ -3,8 +3,8 @@ import posed_sets
 import pytest
 from PIL import Image
 
+from recon_cli.datasets.colmap import read_colmap
 from recon_cli.errors import FormatError
-from recon_cli.io.colmap_set import read_colmap
 
 COUNT = 6
 

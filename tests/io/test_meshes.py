@@ -11,7 +11,7 @@ import trimesh
 
 from recon_cli.errors import FormatError
 from recon_cli.io.meshes import SUFFIXES, Mesh, read_mesh, simplify, write_mesh
-from recon_cli.io.splats.glb import Z_UP
+from recon_cli.splats.glb import Z_UP
 
 pytestmark = pytest.mark.floors
 

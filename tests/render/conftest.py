@@ -10,7 +10,7 @@ import pytest
 import torch
 from numba_runs import Run, compile_for_avx2, damage_and_repair, read_run
 
-from recon_cli.render.numba.simd import LANES
+from recon_cli.kernels.simd import LANES
 
 BuildOnce = Callable[[str, Callable[[Path], object]], Path]
 

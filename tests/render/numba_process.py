@@ -16,13 +16,14 @@ import torch
 from numba.core.registry import CPUDispatcher
 from scenes import camera_at, leaves, random_splats
 
+from recon_cli.kernels import kernel
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import render
 from recon_cli.render.numba import (
     backend,
     binning,
     composite_backward,
     compositing,
-    kernel,
     loss,
     optimizer,
     project_backward,
@@ -30,7 +31,6 @@ from recon_cli.render.numba import (
     soa,
     step,
 )
-from recon_cli.render.numba.thread_pool import pool
 
 STATISTICS = ("radii", "hits", "blend_sum", "blend_max", "means2d_grad", "variance",
               "loo")

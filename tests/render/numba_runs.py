@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon_cli.render.numba import backend, kernel
+from recon_cli.kernels import kernel
+from recon_cli.render.numba import backend
 
 HERE = Path(__file__).parent
 # What every CPU with AVX2 has; numba takes the name and the features together.

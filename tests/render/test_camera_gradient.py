@@ -6,11 +6,11 @@ import torch
 from scenes import camera_at, leaves, move_camera, one_splat, random_splats
 
 from recon_cli.config.stages import TrainConfig
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import render
 from recon_cli.render.camera_gradient import camera_gradient
 from recon_cli.render.contract import StepOptions
 from recon_cli.render.numba import step as numba_step
-from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.gradient import gradient_step, photometric_loss

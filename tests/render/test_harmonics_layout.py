@@ -19,9 +19,9 @@ from backends import (
 )
 from scenes import camera_at, joined, one_splat, random_splats, with_harmonics
 
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.render.numba.step import PhotometricStep
-from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.splats import TERMS, with_rows
 
 N = 70

@@ -8,8 +8,8 @@ import pytest
 from facts import assert_facts
 from report_workspace import SFM, bring, page_of, prepared, section, summaries
 
-from recon_cli.io.records import Frame
 from recon_cli.report.parts import advise, describe_time, find_moments
+from recon_cli.workspace.records import Frame
 from recon_cli.workspace.summaries import PartSummary
 
 FILM = "a.mp4"

@@ -7,8 +7,8 @@ import numpy as np
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io.images import write_png
-from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.stages import sfm
+from recon_cli.workspace.records import Frame, FrameList, Group
 
 
 def every_nth(video, step, count):

@@ -10,7 +10,7 @@ from tiny_scene import make_inputs
 
 from recon_cli.config.stages import PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.io.ply import read_ply
+from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
 from recon_cli.train import fit
 from recon_cli.train import plan as planning

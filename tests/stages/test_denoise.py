@@ -9,8 +9,8 @@ from recon_cli.config.stages import DenoiseConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError
 from recon_cli.io.images import read_png, write_png
-from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.stages import denoise
+from recon_cli.workspace.records import Frame, FrameList, Group
 
 SIGMAS = {"000000.png": 0, "000004.png": 15, "000008.png": 0, "000012.png": 8}
 

@@ -15,12 +15,12 @@ from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.evaluation import reference_views
 from recon_cli.evaluation.metrics import psnr, ssim
-from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.io.images import read_image, write_png
-from recon_cli.io.ply import read_ply
-from recon_cli.io.records import ImportRecord
+from recon_cli.io.training_scene import load_scene
+from recon_cli.splats.ply import read_ply
 from recon_cli.stages import evaluate
 from recon_cli.trust.scene_trust import Trust, TrustRecord, digest_of
+from recon_cli.workspace.records import ImportRecord
 
 
 @pytest.fixture
@@ -161,7 +161,7 @@ def test_trust_is_measured_checked_on_held_out_views_and_drawn(inputs, tmp_path)
     assert trust.agreement.views == VIEWS // 4
     assert trust.agreement.ause < trust.agreement.ause_depth
     assert trust.error.calibrated
-    assert trust.views == len(load_scene(inputs, validation=CONFIG.validation).train)
+    assert trust.views == len(load_scene(inputs.folders, validation=CONFIG.validation).train)
     assert sorted(path.name for path in (out / "trust" / "pruned").iterdir()) == [
         f"{i:06d}.png" for i in range(0, VIEWS, 4)]
     splats = read_ply(inputs.folders["prune"] / "splats.ply")

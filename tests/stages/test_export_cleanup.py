@@ -12,8 +12,8 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import ExportConfig, ImportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, StageError
-from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.scene.splats import Splats, joined
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export, import_scene
 
 CONTEXT = StageContext(backend="numba")

@@ -16,9 +16,9 @@ from recon_cli.config.stages import PLAN, ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError, StageError
 from recon_cli.io.colmap import read_images
-from recon_cli.io.ply import read_ply, read_ply_points, write_ply
-from recon_cli.io.splats.registry import FORMATS, SplatFormat, read_splats
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS
+from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
+from recon_cli.splats.registry import FORMATS, SplatFormat, read_splats
 from recon_cli.stages import export
 from recon_cli.workspace.export_record import MAX_LOSS_DB
 

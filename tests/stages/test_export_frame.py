@@ -18,12 +18,12 @@ from recon_cli.config.stages import ExportConfig, RunConfig, read_matrix
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
-from recon_cli.io.ply import read_ply, read_ply_points, write_ply
-from recon_cli.io.splats.registry import read_splats
-from recon_cli.io.splats.spz import read_spz, unpack
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
+from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
+from recon_cli.splats.registry import read_splats
+from recon_cli.splats.spz import read_spz, unpack
 from recon_cli.stages import export
 from recon_cli.train.train_data import write_config
 from recon_cli.workspace.atomic import write_json

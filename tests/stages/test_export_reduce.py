@@ -10,13 +10,13 @@ from tiny_stages import CONTEXT, LEARNT
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
-from recon_cli.evaluation.reference_views import load_scene
 from recon_cli.export.reduce import fit_to_size
 from recon_cli.export.verify import load_reference_psnr
-from recon_cli.io.ply import read_ply
-from recon_cli.io.splats.registry import FORMATS, scene_file
+from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0
+from recon_cli.splats.ply import read_ply
+from recon_cli.splats.registry import FORMATS, scene_file
 from recon_cli.stages import export
 
 
@@ -58,7 +58,7 @@ def test_without_its_backdrop_a_scene_is_on_black_and_the_loss_is_said(inputs, w
     assert len(FORMATS["spz"].read(tmp_path / "splats.spz")) == len(whole)
     (change,) = summary.changes
     assert (change.option, change.gaussians) == ("drop_backdrop", len(whole))
-    scene = load_scene(inputs, validation=LEARNT.validation)
+    scene = load_scene(inputs.folders, validation=LEARNT.validation)
     psnr = load_reference_psnr(scene, Similarity(), LEARNT.max_size, CONTEXT)
     assert change.psnr_change_db == pytest.approx(
         psnr.psnr_db(back) - psnr.psnr_db(whole), abs=1e-3)
@@ -87,7 +87,7 @@ def test_a_lower_degree_keeps_the_colours_that_the_views_see(inputs, whole, tmp_
     assert back.sh_degree == 1
     (change,) = summary.changes
     assert (change.degree, change.degree_before) == (1, 3)
-    scene = load_scene(inputs, validation=LEARNT.validation)
+    scene = load_scene(inputs.folders, validation=LEARNT.validation)
     psnr = load_reference_psnr(scene, Similarity(), LEARNT.max_size, CONTEXT)
     cut = psnr.psnr_db(whole.with_degree(1)) - psnr.psnr_db(whole)
     assert cut < change.psnr_change_db - 0.1

@@ -13,10 +13,10 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
-from recon_cli.io.ply import read_ply, write_ply
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export
 
 

@@ -9,11 +9,11 @@ from tiny_stages import CONTEXT
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import StageError
-from recon_cli.io.ply import read_ply
-from recon_cli.io.ply_tables import read_header, read_tables
-from recon_cli.io.records import ImportRecord
+from recon_cli.splats.ply import read_ply
+from recon_cli.splats.ply_tables import read_header, read_tables
 from recon_cli.stages import export
 from recon_cli.trust.ply_property import PLY_PROPERTY, match_rows
+from recon_cli.workspace.records import ImportRecord
 
 
 @pytest.fixture

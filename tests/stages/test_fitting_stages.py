@@ -15,7 +15,7 @@ from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, r
 from recon_cli.config.stages import ExportConfig, PruneConfig, RunConfig
 from recon_cli.context import TrainCallback
 from recon_cli.errors import FormatError, StageError, TrainingError
-from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export, prune, train
 from recon_cli.train import prune_run, runner
 

@@ -11,7 +11,7 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.export import verify
-from recon_cli.io.ply import read_ply, write_ply
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import evaluate, export, prune, train
 from recon_cli.train import runner
 from recon_cli.train.state import save_state

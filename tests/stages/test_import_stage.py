@@ -15,17 +15,17 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import ExportConfig, ImportConfig, PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
-from recon_cli.io.ply import describe_scene, read_ply, write_ply
-from recon_cli.io.records import ImportRecord
-from recon_cli.io.splats.axes import turn_from
-from recon_cli.io.splats.glb import nearest_axes, write_glb
-from recon_cli.io.splats.registry import FORMATS, load_scene, scene_file
-from recon_cli.io.splats.spz import write_spz
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import transformed
+from recon_cli.splats.axes import turn_from
+from recon_cli.splats.glb import nearest_axes, write_glb
+from recon_cli.splats.ply import describe_scene, read_ply, write_ply
+from recon_cli.splats.registry import FORMATS, load_scene, scene_file
+from recon_cli.splats.spz import write_spz
 from recon_cli.stages import evaluate, export, import_scene, prune
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_json
+from recon_cli.workspace.records import ImportRecord
 
 TURN = np.array([[0.0, -1, 0], [0.6, 0, 0.8], [-0.8, 0, 0.6]])
 WORLD = Similarity(2.5, TURN, np.array([3.0, -1, 2]))  # from the source's frame to the workspace's

@@ -8,9 +8,9 @@ from foreign import recon, truth, with_views
 
 from recon_cli.cli import main
 from recon_cli.config.settings import read_settings
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.splats.spz import write_spz
 from recon_cli.pipeline.plan import Job, status
+from recon_cli.splats.ply import read_ply, write_ply
+from recon_cli.splats.spz import write_spz
 from recon_cli.workspace.digests import digest_file
 from recon_cli.workspace.layout import Workspace
 

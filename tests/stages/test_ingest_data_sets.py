@@ -20,7 +20,7 @@ from posed_sets import (
 
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.records import POSES, read_poses
+from recon_cli.workspace.records import POSES, read_poses
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import pytest
 import torch
 from foreign import recon
 
-from recon_cli.io.splats.registry import read_splats
+from recon_cli.splats.registry import read_splats
 
 pytestmark = pytest.mark.integration
 

@@ -95,7 +95,7 @@ def test_the_largest_view_decides_the_memory_and_masks_are_counted(tmp_path, mon
     monkeypatch.setattr(train_data, "estimate_memory", recorded)
     inputs = make_inputs(tmp_path, TWO[::-1])  # the smaller one comes first
     write_masks(inputs, {"000001.png": np.ones((44, 30), bool)})
-    scene = reference_views.load_scene(inputs, validation=0.1)
+    scene = reference_views.load_scene(inputs.folders, validation=0.1)
     train_data.load_task(scene, CONFIG, StageContext())
     assert (asked[0]["width"], asked[0]["height"], asked[0]["masks"]) == (48, 36, 1)
 

@@ -13,7 +13,7 @@ from tiny_scene import Shape, make_inputs
 from recon_cli.config.stages import PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import TrainingError
-from recon_cli.io.ply import read_ply
+from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
 from recon_cli.train import fit, train_data
 from recon_cli.train import plan as planning

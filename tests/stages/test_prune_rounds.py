@@ -12,9 +12,9 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import PRUNE_SCORES, PruneConfig, RunConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, TrainingError
-from recon_cli.io.ply import read_ply
 from recon_cli.render.registry import use_threads
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS
+from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
 from recon_cli.train import prune_run, runner
 from recon_cli.train.state import save_state

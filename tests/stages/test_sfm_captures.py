@@ -9,12 +9,12 @@ from facts import assert_facts
 from sfm_inputs import run, texture, write_inputs
 
 from recon_cli.errors import SfmError
-from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.sfm import database
 from recon_cli.sfm.job import CLIP_SECONDS
 from recon_cli.sfm.verdict import find_jumps
 from recon_cli.stages import sfm
+from recon_cli.workspace.records import Frame, FrameList, Group
 
 
 def frames(path, *, first=0, step=4, count=8, prefix=""):

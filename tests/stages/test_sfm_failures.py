@@ -12,11 +12,11 @@ from sfm_inputs import run, texture, turning, write_inputs
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, SfmError
-from recon_cli.io.records import Frame, FrameList, Group
 from recon_cli.sfm import database, time_estimate
 from recon_cli.sfm.job import CameraGroup, StepLog
 from recon_cli.sfm.segments import SegmentRuns
 from recon_cli.stages import sfm
+from recon_cli.workspace.records import Frame, FrameList, Group
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary
 
 

@@ -11,8 +11,8 @@ from sfm_inputs import every_nth, run, texture, write_inputs
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images, read_scene
 from recon_cli.io.images import read_png, write_png
-from recon_cli.io.records import Frame, FrameList, Group, KnownPoses
 from recon_cli.scene.camera import Lens
+from recon_cli.workspace.records import Frame, FrameList, Group, KnownPoses
 from recon_cli.workspace.summaries import PosesSummary, SfmSummary
 
 STEP, COUNT = 4, 9  # every 4th frame of the sample

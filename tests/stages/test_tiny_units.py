@@ -8,7 +8,7 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import TrainingError
-from recon_cli.evaluation.reference_views import load_scene
+from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.camera import Camera
 from recon_cli.train.train_data import load_task
 
@@ -23,7 +23,7 @@ def in_units(scene, factor):
 
 
 def test_half_of_the_points_before_the_near_plane_are_too_many(tmp_path):
-    scene = load_scene(make_inputs(tmp_path), validation=0.0)
+    scene = load_scene(make_inputs(tmp_path).folders, validation=0.0)
     config, ctx = RunConfig(max_gaussians=100), StageContext(backend="numba")
     assert len(load_task(scene, config, ctx).train) == len(scene.train)
     assert load_task(in_units(scene, 1000), config, ctx).extent == pytest.approx(

@@ -8,11 +8,11 @@ import torch
 from foreign import recon, truth, with_views
 
 from recon_cli.cli import main
-from recon_cli.io.ply import read_ply, write_ply
-from recon_cli.io.records import ImportRecord
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.train import runner
 from recon_cli.train.state import save_state
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.records import ImportRecord
 
 pytestmark = pytest.mark.integration
 

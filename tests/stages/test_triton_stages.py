@@ -15,7 +15,7 @@ from tiny_stages import CONTEXT, run
 
 from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
 from recon_cli.context import StageInputs
-from recon_cli.io.ply import read_ply
+from recon_cli.splats.ply import read_ply
 from recon_cli.stages import evaluate, prune, train
 from recon_cli.train import runner
 from recon_cli.train.state import save_state

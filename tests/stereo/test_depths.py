@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from walls import AROUND, HEIGHT, UP, camera, errors, grain, shading, views_of, wall
 
-from recon_cli.export.mesh.volume import pixel_rays
-from recon_cli.render.numba.thread_pool import pool
+from recon_cli.kernels.thread_pool import pool
+from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo import kernels

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon_cli.export.mesh.volume import pixel_rays
+from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.train_view import TrainView
 

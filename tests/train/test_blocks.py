@@ -10,10 +10,10 @@ from recon_cli.cli import main
 from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs, TrainCallback
 from recon_cli.errors import ConfigError, FormatError
-from recon_cli.io.ply import read_ply
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import NullProgress
 from recon_cli.scene.cells import Cell
+from recon_cli.splats.ply import read_ply
 from recon_cli.stages import train as stage
 from recon_cli.train import blocks, merge_blocks, runner
 from recon_cli.train.blocks import BlockJob, count_blocks

@@ -7,9 +7,9 @@ from scenes import camera_at, random_splats
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.io.images import fill_masked
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
-from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.gradient import gradient_step, photometric_loss

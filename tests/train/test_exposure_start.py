@@ -7,8 +7,8 @@ import av
 import numpy as np
 import pytest
 
-from recon_cli.io.depth_points import points_from_depth
-from recon_cli.io.layouts import read_posed
+from recon_cli.datasets.depth_points import points_from_depth
+from recon_cli.datasets.layouts import read_posed
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import estimate_gains

@@ -19,8 +19,8 @@ from tiny_task import (
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.io.images import fill_masked
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import available_backends, render
-from recon_cli.render.numba.thread_pool import pool
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit import fit, validation_psnr
 from recon_cli.train.gradient import gradient_step

@@ -16,7 +16,7 @@ from adam_runs import (
 from scenes import joined, random_splats
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.render.numba.thread_pool import pool
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.scene.splats import Splats
 from recon_cli.train.optimizer import SplatOptimizer
 

@@ -15,7 +15,7 @@ from viewing import complaints, nodes, until
 
 from recon_cli.cli import main
 from recon_cli.context import StageContext, TrainCallback
-from recon_cli.io.ply import read_ply
+from recon_cli.splats.ply import read_ply
 from recon_cli.stages import train
 from recon_cli.viewer import live
 from recon_cli.viewer.live import SHARE, LiveView

@@ -16,7 +16,7 @@ import torch
 
 from recon_cli.cli import main
 from recon_cli.commands import view
-from recon_cli.io.splats.registry import FORMATS, scene_file
+from recon_cli.splats.registry import FORMATS, scene_file
 from recon_cli.viewer.content import load_file
 
 pytestmark = pytest.mark.floors

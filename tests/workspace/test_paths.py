@@ -10,7 +10,7 @@ from recon_cli.cli import main
 from recon_cli.config.settings import read_settings
 from recon_cli.errors import ExitCode, FormatError, ReconError
 from recon_cli.io.colmap import Reader
-from recon_cli.io.ply_tables import read_header
+from recon_cli.splats.ply_tables import read_header
 from recon_cli.trust.support import Support
 from recon_cli.workspace.atomic import LEFTOVERS, read_json, replacing, write_bytes
 from recon_cli.workspace.digests import read_source

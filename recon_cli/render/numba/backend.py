@@ -22,10 +22,10 @@ from torch import Tensor
 
 from recon_cli.render.contract import (
     EXACT, Approximation, RenderOutput, Statistics, StepOptions, TargetImage)
-from recon_cli.render.numba.kernel import cache_folder, unsaved
+from recon_cli.kernels.kernel import cache_folder, unsaved
 from recon_cli.render.numba.optimizer import step
 from recon_cli.render.numba.step import PhotometricStep, camera_gradient
-from recon_cli.render.numba.thread_pool import pool
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render.numba.view_pass import (
     ImageBuffers, Lease, PackedSplats, RenderSettings, flat)
 from recon_cli.scene.camera import Camera

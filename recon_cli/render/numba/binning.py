@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from recon_cli.render.numba.kernel import inlined, kernel
-from recon_cli.render.numba.simd_functions import fetch_add
+from recon_cli.kernels.kernel import inlined, kernel
+from recon_cli.kernels.simd_functions import fetch_add
 from recon_cli.render.numba.soa import (
     BLOCK, EXTENT_X, EXTENT_Y, FAR, MEAN_X, MEAN_Y, RECORD, SLOPE_Y, TILE_HEIGHT, TILE_WIDTH, U_X,
     U_Y, V_Y)

@@ -19,9 +19,9 @@ import numpy as np
 
 from recon_cli.render.numba.compositing import (
     BATCH_FLOATS, LOCAL, load_instance, log2_alpha, patch_pixels, pixel)
-from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.kernel import kernel
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     bits, broadcast, count_bits, exp2, fetch_add, fill, fma, largest, load, lowest_bit,
     minimum, select, store, totals)
 from recon_cli.render.numba.soa import (

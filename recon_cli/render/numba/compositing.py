@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon_cli.render.numba.kernel import inlined, kernel
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.kernel import inlined, kernel
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     bits, broadcast, count_bits, exp2, fetch_add, fill, floor, fma, lane_numbers, largest, load,
     lowest_bit, maximum, minimum, select, square_root, store, total)
 from recon_cli.render.numba.soa import (

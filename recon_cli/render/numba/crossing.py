@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.numba.compositing import LOCAL, load_batch, log2_alpha, patch_pixels, pixel
-from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.kernel import kernel
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     bits, exp2, fetch_add, fill, load, lowest_bit, minimum, select, store)
 from recon_cli.render.numba.soa import (
     BATCH, LOG2_ALPHA_MAX, PATCHES, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH)

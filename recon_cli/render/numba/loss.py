@@ -14,11 +14,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.render.numba.kernel import inlined, kernel
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.kernel import inlined, kernel
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     absolute, broadcast, fetch_add, fill, fma, lane_numbers, load, load_bytes, select, store, total)
-from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, pool
+from recon_cli.kernels.thread_pool import SCRATCH_FLOATS, pool
 
 RADIUS = 5
 CHANNELS = 3

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from recon_cli.render.numba.kernel import kernel
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.kernel import kernel
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     absolute, fetch_add, fill, fma, load, select, square_root, store)
-from recon_cli.render.numba.thread_pool import pool
+from recon_cli.kernels.thread_pool import pool
 
 BLOCK = 1 << 14  # numbers that a thread takes at a time
 _VANISHED = np.float32(1e-37)  # moments under this are dropped: denormal numbers are slow

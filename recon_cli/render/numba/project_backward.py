@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.contract import DILATION
-from recon_cli.render.numba.kernel import inlined, kernel
+from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.render.numba.projection import C0, direction_gradient, write_basis
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     exp2, fetch_add, fill, fma, load, maximum, minimum, select, square_root, store, transpose)
 from recon_cli.render.numba.soa import (
     BLOCK, BLUE, COUNT, GRAD_BLUE, GRAD_DEPTH, GRAD_GREEN, GRAD_RED, GREEN,

@@ -13,9 +13,9 @@ import math
 import numpy as np
 
 from recon_cli.render.contract import DILATION, NEAR
-from recon_cli.render.numba.kernel import inlined, kernel
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.kernel import inlined, kernel
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     absolute, bits, count_bits, exp2, fetch_add, fill, lane_numbers, load, log2, lowest_bit,
     maximum, minimum, square_root, store, transpose)
 from recon_cli.render.numba.soa import (

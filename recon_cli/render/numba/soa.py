@@ -9,13 +9,12 @@ written behind the last row.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from recon_cli.render.numba.kernel import inlined
-from recon_cli.render.numba.simd import LANES
-from recon_cli.render.numba.simd_functions import (
+from recon_cli.kernels.kernel import inlined
+from recon_cli.kernels.simd import LANES
+from recon_cli.kernels.simd_functions import (
     absolute, fill, load, maximum, minimum, select, square_root, store, transpose)
 
 TILE_WIDTH, TILE_HEIGHT = 2 * LANES, 16
@@ -52,24 +51,6 @@ LOG2_ALPHA_MAX = math.log2(0.99)
 
 BLOCK = 1024  # Gaussians that a thread takes at a time
 _F = np.float32
-
-
-class Viewpoint(NamedTuple):
-    """A camera as kernels take it: world to camera R x + t, pixels, limits of x/z and y/z."""
-
-    R: np.ndarray  # [9] float64
-    t: np.ndarray  # [3] float64
-    center: np.ndarray  # [3] float64
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-    tan_left: float
-    tan_right: float
-    tan_top: float
-    tan_bottom: float
 
 
 # planes of a group of LANES Gaussians in scratch

@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.render.contract import Statistics, StepOptions, TargetImage
-from recon_cli.render.numba.kernel import kernel
+from recon_cli.kernels.kernel import kernel
 from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
-from recon_cli.render.numba.simd_functions import fetch_add
-from recon_cli.render.numba.thread_pool import pool
+from recon_cli.kernels.simd_functions import fetch_add
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render.numba.view_pass import (
     ImageBuffers, PackedSplats, RenderSettings, ViewPass, flat)
 from recon_cli.scene.camera import Camera

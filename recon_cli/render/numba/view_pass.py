@@ -22,14 +22,12 @@ from recon_cli.render.numba.crossing import find_crossing
 from recon_cli.render.numba.project_backward import GRADIENT_FLOATS, project_backward
 from recon_cli.render.numba.projection import compact, cull, project
 from recon_cli.render.numba.soa import (
-    BLOCK, PROJECTION_FLOATS, RECORD, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Viewpoint)
-from recon_cli.render.numba.thread_pool import SCRATCH_FLOATS, empty_aligned, pool
+    BLOCK, PROJECTION_FLOATS, RECORD, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH)
+from recon_cli.kernels.viewpoint import viewpoint
+from recon_cli.kernels.thread_pool import SCRATCH_FLOATS, empty_aligned, pool
 from recon_cli.scene.camera import Camera
 
 assert max(PROJECTION_FLOATS, GRADIENT_FLOATS, FORWARD_FLOATS, BACKWARD_FLOATS) <= SCRATCH_FLOATS
-
-_MARGIN = 0.15  # of the image on each side, within which x/z and y/z are clamped
-
 
 @dataclass(frozen=True)
 class PackedSplats:
@@ -82,19 +80,6 @@ def flat(tensor: Tensor) -> NDArray[np.float32]:
     """Returns a CPU tensor as a flat array: the same memory where it is contiguous."""
     array: NDArray[np.float32] = tensor.detach().contiguous().numpy().reshape(-1)
     return array
-
-
-def viewpoint(camera: Camera) -> Viewpoint:
-    """Returns a camera as kernels take it."""
-    wide, high = _MARGIN * camera.width, _MARGIN * camera.height
-    return Viewpoint(
-        np.ascontiguousarray(camera.viewmat[:3, :3], np.float64).reshape(-1),
-        np.ascontiguousarray(camera.viewmat[:3, 3], np.float64),
-        np.ascontiguousarray(camera.center, np.float64),
-        float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy),
-        int(camera.width), int(camera.height),
-        (-camera.cx - wide) / camera.fx, (camera.width - camera.cx + wide) / camera.fx,
-        (-camera.cy - high) / camera.fy, (camera.height - camera.cy + high) / camera.fy)
 
 
 class ViewPass:

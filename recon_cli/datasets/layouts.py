@@ -1,0 +1,149 @@
+"""The layouts of data sets with poses, recognised by names of files and folders alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from recon_cli.capture.mask_files import mask_folders, match_masks
+from recon_cli.datasets.colmap import is_colmap, lacks_cameras, read_colmap
+from recon_cli.datasets.kinect import (
+    find_unposed,
+    is_seven_scenes,
+    is_tum,
+    read_seven_scenes,
+    read_tum,
+)
+from recon_cli.datasets.posed import PosedSet
+from recon_cli.datasets.rgbd import (
+    is_replica,
+    is_scannet,
+    lacks_trajectory,
+    read_replica,
+    read_scannet,
+)
+from recon_cli.datasets.transforms import is_transforms, read_transforms
+from recon_cli.errors import FormatError, InputError, list_names
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A known layout."""
+
+    name: str  # as `PosedSet.layout` has it
+    words: str  # its name in a sentence
+    needs: str  # its files, for help texts
+    fits: Callable[[Path], bool]  # returns whether a path has the layout
+    read: Callable[[Path], PosedSet]  # returns the data set at such a path
+
+
+# The first that fits wins: nerfstudio leaves the COLMAP model beside its transforms.json.
+LAYOUTS: tuple[Layout, ...] = (
+    Layout("replica", "a Replica sequence (NICE-SLAM layout)",
+           "results/frame%06d.jpg, traj.txt and cam_params.json", is_replica, read_replica),
+    Layout("scannet", "a ScanNet scene (exported)",
+           "color/, pose/ and intrinsic/, with depth/ or without", is_scannet, read_scannet),
+    Layout("7scenes", "a 7-Scenes sequence",
+           "frame-000000.color.png, .depth.png and .pose.txt in one folder", is_seven_scenes,
+           read_seven_scenes),
+    Layout("tum", "a TUM RGB-D sequence", "rgb/, rgb.txt and groundtruth.txt, with depth/ or "
+           "without", is_tum, read_tum),
+    Layout("transforms", "a transforms.json data set (nerfstudio, instant-ngp)",
+           "transforms.json, or transforms_train.json, and the images", is_transforms,
+           read_transforms),
+    Layout("colmap", "a COLMAP model", "images/ and sparse/0/", is_colmap, read_colmap),
+)
+
+
+def recognise(path: Path) -> str | None:
+    """Returns the name of the layout that a path has, None where it has no known one."""
+    return next((row.name for row in LAYOUTS if row.fits(path)), None)
+
+
+def refuse_incomplete(path: Path) -> None:
+    """Raises FormatError for a data set without poses or cameras, rather than read it as photos."""
+    if path.name == "results" and is_replica(path.parent):
+        raise FormatError(
+            f"{path} holds frames and depth maps of a Replica sequence, but no poses.",
+            hint=f"Give {path.parent}; or give {path / 'frame*'} to estimate the cameras.")
+    if lacks_cameras(path):
+        lacks, images = "a COLMAP model without cameras.bin or cameras.txt", path / "images"
+    elif lacks_trajectory(path):
+        lacks, images = "Replica frames without traj.txt", path / "results" / "frame*"
+    elif unposed := find_unposed(path):
+        lacks, images = unposed
+    else:
+        return
+    raise FormatError(
+        f"{path} holds {lacks}.",
+        hint=f"Copy that file too, or give {images} to estimate the cameras.")
+
+
+def read_posed(path: Path) -> PosedSet:
+    """Returns the data set at a path; InputError if unknown or empty, FormatError if damaged."""
+    layout = next((row for row in LAYOUTS if row.fits(path)), None)
+    if layout is None:
+        known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
+        raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
+    try:
+        return _attach_masks(layout.read(path), path if path.is_dir() else path.parent)
+    except FormatError as error:
+        if error.hint:
+            raise
+        raise FormatError(
+            error.message, hint="Copy the data set again, or export it again.") from error
+    except OSError as error:  # a folder where a file belongs, or a file that may not be read
+        raise FormatError(f"{path} cannot be read: {error}.") from error
+
+
+def describe(posed: PosedSet) -> str:
+    """Returns the layout and content of a data set in words, without the notices."""
+    words = next(row.words for row in LAYOUTS if row.name == posed.layout)
+    held_out = sum(image.held_out for image in posed.images)
+    depth = sum(image.depth is not None for image in posed.images if not image.held_out)
+    parts = [_count(len(posed.images) - held_out, "frame" if posed.sequence else "image")]
+    if depth:
+        parts.append(f"{depth} with depth")
+    if held_out:
+        parts.append(_count(held_out, "held-out view"))
+    if posed.points is not None:
+        parts.append(_count(len(posed.points), "point"))
+    if posed.missing:
+        parts.append(f"{_count(len(posed.missing), 'image')} missing")
+    return f"{words}: {', '.join(parts)}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def _attach_masks(posed: PosedSet, folder: Path) -> PosedSet:
+    """Returns a data set whose images have the masks that lie in its folder or beside the images.
+
+    Masks that the set itself names stay.
+    """
+    bare = {image.name: PurePosixPath(image.name) for image in posed.images if image.mask is None}
+    listed = {image.mask for image in posed.images}
+    homes = dict.fromkeys([folder, *(
+        image.path.parents[len(PurePosixPath(image.name).parts)] for image in posed.images
+        if image.path.is_relative_to(folder) and len(image.path.relative_to(folder).parts)
+        > len(PurePosixPath(image.name).parts))])
+    found: dict[str, Path] = {}
+    unused: list[str] = []
+    for place in dict.fromkeys(place for home in homes for place in mask_folders(home)):
+        masks, left = match_masks(place, bare)
+        found = {**masks, **found}
+        unused += [name for name in left if place / name not in listed]
+    images = tuple(replace(image, mask=found[image.name]) if image.name in found else image
+                   for image in posed.images)
+    notices = list(posed.notices)
+    if found:
+        notices.append(f"{len(found)} of its images have masks")
+    if unused:
+        first = posed.images[0].name
+        notices.append(
+            f"masks without an image are left out: {list_names(unused)}"
+            + f"; that of {first} must be called {first}.png or "
+            f"{PurePosixPath(first).with_suffix('.png')}" * (not found))
+    return replace(posed, images=images, notices=tuple(notices))

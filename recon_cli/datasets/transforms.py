@@ -1,0 +1,373 @@
+"""transforms.json of nerfstudio and instant-ngp; transforms_train/val/test.json of NeRF's scenes.
+
+Poses are camera to world with OpenGL axes (x right, y up, looking along -z), converted from and to
+world to camera with OpenCV axes; the world stays as it is. Intrinsics are in pixels with the centre
+of the first one at 0.5. nerfstudio's applied_transform was applied to poses and points alike and is
+not undone.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.datasets.file_finder import FileFinder
+from recon_cli.datasets.posed import (
+    DepthFile,
+    PosedImage,
+    PosedSet,
+    find_images,
+    image_size,
+    is_file,
+    resolve_inside,
+)
+from recon_cli.errors import FormatError, InputError
+from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
+from recon_cli.scene.camera import Camera, Lens, make_lens
+from recon_cli.workspace.atomic import read_json, write_json
+
+_FISHEYE = ("OPENCV_FISHEYE",)
+# They share one meaning of k1, k2, p1, p2, and leave at zero what they do not have.
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # COLMAP's order in FULL_OPENCV
+_LARGEST = sys.float_info.max
+_FILE = "transforms.json"
+_PARTS = ("train", "val", "test")
+_DEPTH_UNIT = 1e-3  # nerfstudio's default: depth in millimetres
+_HINT = "Export it again from the program that it came from."
+
+
+def read_lens(entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
+    """Returns the lens of a frame.
+
+    `entry` has the keys of the frame over those of the file; `size` is (width, height), for where w
+    and h are not given. FormatError if the focal length is missing or an entry cannot be used.
+    """
+    width = read_number(entry, "w", where) or float(size[0])
+    height = read_number(entry, "h", where) or float(size[1])
+    fx = _focal(entry, "x", width, where)
+    fy = _focal(entry, "y", height, where)
+    if fx is None and fy is None:
+        raise FormatError(
+            f"{where} has no focal length: neither fl_x nor camera_angle_x.",
+            hint="Add fl_x, fl_y, cx, cy, w and h in pixels.")
+    cx, cy = read_number(entry, "cx", where), read_number(entry, "cy", where)
+    inner = (
+        fx if fx is not None else fy, fy if fy is not None else fx,
+        width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    model, coefficients = _distortion(entry, where)
+    params = [value for value in (*inner, *coefficients) if value is not None]
+    return make_lens(model, width, height, params, where)
+
+
+def _focal(entry: Mapping[str, Any], axis: str, side: float, where: str) -> float | None:
+    """Returns the focal length along an axis, given as such or as the angle of view."""
+    focal = read_number(entry, f"fl_{axis}", where)
+    if focal is not None:
+        return focal
+    angle = read_number(entry, f"camera_angle_{axis}", where)
+    if angle is None:
+        return None
+    if not 0 < angle < math.pi:
+        raise FormatError(
+            f"{where} has camera_angle_{axis} = {angle:g}; needed are radians below pi.")
+    return side / 2 / math.tan(angle / 2)
+
+
+def _distortion(entry: Mapping[str, Any], where: str) -> tuple[str, tuple[float, ...]]:
+    """Returns the camera model and its distortion coefficients."""
+    named = entry.get("camera_model", "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV")
+    values = {key: read_number(entry, key, where) or 0.0 for key in _COEFFICIENTS}
+    if named in _FISHEYE:
+        if values["p1"] or values["p2"]:
+            raise FormatError(f"{where}: {named} has no tangential distortion p1, p2.")
+        return "OPENCV_FISHEYE", tuple(values[key] for key in ("k1", "k2", "k3", "k4"))
+    if named not in _PERSPECTIVE:
+        raise FormatError(
+            f"{where} has the camera model {named}, known are "
+            f"{', '.join(_PERSPECTIVE + _FISHEYE)}.",
+            hint="Undistort the images first, for example with COLMAP's image_undistorter.")
+    if not any(values.values()):
+        return "PINHOLE", ()
+    # nerfstudio's k4 is a fourth power of r^2, COLMAP's a divisor.
+    if values["k4"] and named != "FULL_OPENCV":
+        raise FormatError(f"{where} has k4 = {values['k4']:g}, which {named} does not have.")
+    if named == "FULL_OPENCV" or values["k3"]:
+        return "FULL_OPENCV", tuple(values[key] for key in _COEFFICIENTS)
+    return "OPENCV", tuple(values[key] for key in ("k1", "k2", "p1", "p2"))
+
+
+def read_number(entry: Mapping[str, Any], key: str, where: str) -> float | None:
+    """Returns the finite number under a key, None where there is none; else FormatError."""
+    value = entry.get(key)
+    if value is None:
+        return None
+    # Whole numbers in JSON may be larger than any float.
+    if type(value) not in (int, float) or not abs(value) <= _LARGEST:
+        raise FormatError(f"{where} has {key} = {value!r:.40}; needed is a finite number.")
+    return float(value)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """One entry of a file; `part` is train, val, test, "" for none of them, or None if unknown."""
+
+    entry: Mapping[str, Any]
+    where: str
+    folder: Path
+    path: Path
+    part: str | None
+
+    @property
+    def listed(self) -> PurePosixPath:
+        """The path below the folder."""
+        return PurePosixPath(self.path.relative_to(self.folder).as_posix())
+
+
+def is_transforms(path: Path) -> bool:
+    """Returns whether a folder has the layout, or a file is such a .json by its name."""
+    if path.suffix == ".json" and path.is_file():
+        return path.name.startswith("transforms")
+    return (path / _FILE).is_file() or (path / "transforms_train.json").is_file()
+
+
+def read_transforms(path: Path) -> PosedSet:
+    """Returns the frames of a transforms.json, or of transforms_train/val/test.json.
+
+    If the set names test views, these are held out and its validation views are left out, as the
+    literature scores it; if it names validation views alone, those are held out. InputError if no
+    image exists; FormatError if a file is damaged or a frame incomplete.
+    """
+    frames: list[_Frame] = []
+    lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
+    finder = FileFinder(path.parent if path.is_file() else path, [
+        entry[key] for _, _, (_, entries) in lists for entry in entries
+        for key in ("file_path", "depth_file_path", "mask_path") if key in entry])
+    for file, part, (common, entries) in lists:
+        frames += _list_entries(file, part, common, entries, finder)
+    frames, notices = _drop_duplicates(frames)
+    held_out = "test" if "test" in {frame.part for frame in frames} else "val"
+    used = [frame for frame in frames if frame.part in (None, "train", held_out)]
+    left_out = len(frames) - len(used)
+    if left_out:
+        notices.append(f"{left_out} frames are left out: the set keeps them for validation, or "
+                       "lists them in no part")
+    listed, missing = [], []
+    for frame, name in zip(used, _short_names(used), strict=True):
+        if is_file(frame.path):
+            listed.append(_list_frame(frame, name, held_out, finder))
+        else:
+            missing.append(name)
+    posed = find_images("transforms", listed, path, missing=missing)
+    points, colors, point_notices = _read_points(path if path.is_file() else path / _FILE)
+    notices += [*finder.notices(), *_describe_unread(used)]
+    return replace(
+        posed, metric=any(image.depth is not None for image in posed.images),
+        splits=any(image.held_out for image in posed.images), points=points, colors=colors,
+        notices=(*notices, *posed.notices, *point_notices))
+
+
+def _describe_unread(frames: Sequence[_Frame]) -> list[str]:
+    """Returns a notice about depth that is named by another key than nerfstudio's."""
+    other = sum(frame.entry.get("depth_path") is not None
+                and frame.entry.get("depth_file_path") is None for frame in frames)
+    return [f"{other} frames name their depth by depth_path, as NeRFCapture does, which is not "
+            "read; depth_file_path is, with depth_unit_scale_factor, the metres of a value of 1"
+            ] * (other > 0)
+
+
+def _files(path: Path) -> list[tuple[Path, str | None]]:
+    """Returns the files to read, each with the part of the set that it holds."""
+    if path.is_file():
+        return [(path, None)]
+    if (path / _FILE).is_file():
+        return [(path / _FILE, None)]
+    files = [(path / f"transforms_{part}.json", part) for part in _PARTS]
+    return [(file, part) for file, part in files if file.is_file()]
+
+
+def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Returns what a file says of all frames, and its entries."""
+    value = read_json(file, hint=_HINT, finite=False)
+    entries = value.get("frames") if isinstance(value, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise FormatError(f"{file} lists no frames.", hint=_HINT)
+    for at, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise FormatError(f"{file}, frame {at}, is no entry with names.", hint=_HINT)
+    return {key: item for key, item in value.items() if key != "frames"}, entries
+
+
+def _list_entries(
+    file: Path, part: str | None, common: dict[str, Any], entries: Sequence[dict[str, Any]],
+    finder: FileFinder,
+) -> list[_Frame]:
+    parts = _read_parts(common, file)
+    frames = []
+    for at, entry in enumerate(entries):
+        text = entry.get("file_path")
+        path = finder.find(text, f"{file}, frame {at},")
+        own = part if parts is None else parts.get(_plain(text), "")
+        frames.append(_Frame({**common, **entry}, f"{file}, frame {text},", file.parent, path, own))
+    return frames
+
+
+def _read_parts(shared: Mapping[str, Any], file: Path) -> dict[str, str] | None:
+    """Returns the part of each file name that nerfstudio's lists give, None without lists.
+
+    A name in several lists belongs to the last of train, val and test: what is scored is not
+    trained on. Without a list of training views every other frame is one.
+    """
+    lists = {part: shared.get(f"{part}_filenames") for part in _PARTS}
+    if all(names is None for names in lists.values()):
+        return None
+    parts: dict[str, str] = {}
+    if lists["train"] is None:
+        raise FormatError(
+            f"{file} has val_filenames or test_filenames, but no train_filenames.", hint=_HINT)
+    for part, names in lists.items():
+        if names is not None and not isinstance(names, list):
+            raise FormatError(f"{file}: {part}_filenames is no list.", hint=_HINT)
+        parts.update({_plain(name): part for name in names or ()})
+    return parts
+
+
+def _plain(name: object) -> str:
+    return PurePosixPath(str(name)).as_posix()
+
+
+def _drop_duplicates(frames: Sequence[_Frame]) -> tuple[list[_Frame], list[str]]:
+    """Returns the frames without those listed twice with the same pose, and a notice."""
+    unique: dict[Path, _Frame] = {}
+    copies = []
+    for frame in frames:
+        first = unique.setdefault(frame.path, frame)
+        if first is frame:
+            continue
+        if first.entry.get("transform_matrix") != frame.entry.get("transform_matrix"):
+            raise FormatError(
+                f"{frame.where} is listed more than once with different poses.",
+                hint="Leave one pose for each image.")
+        copies.append(frame.listed)
+        if _rank(frame.part) > _rank(first.part):
+            unique[frame.path] = frame
+    notices = []
+    if copies:
+        notices.append(f"{len(copies)} images are listed more than once, the first is {copies[0]}")
+    return list(unique.values()), notices
+
+
+def _rank(part: str | None) -> int:
+    return _PARTS.index(part) if part in _PARTS else -1
+
+
+def _short_names(frames: Sequence[_Frame]) -> list[str]:
+    """Returns the listed paths without the folders that all of them share."""
+    parts = [frame.listed.parts for frame in frames]
+    folders = [path[:-1] for path in parts]
+    shared = 0
+    while folders and all(len(path) > shared and path[shared] == folders[0][shared]
+                          for path in folders):
+        shared += 1
+    return ["/".join(path[shared:]) for path in parts]
+
+
+def _list_frame(frame: _Frame, name: str, held_out: str, finder: FileFinder) -> PosedImage:
+    viewmat = viewmat_from_pose(
+        frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
+    lens = read_lens(frame.entry, image_size(frame.path), frame.where)
+    depth, unit = _beside(frame, "depth_file_path", finder), _unit(frame)
+    return PosedImage(
+        name, frame.path, lens, viewmat, frame.part == held_out,
+        None if depth is None else DepthFile(depth, unit, lens),
+        _beside(frame, "mask_path", finder))
+
+
+def _beside(frame: _Frame, key: str, finder: FileFinder) -> Path | None:
+    """Returns the file of depth or mask that a frame names, which must exist."""
+    if frame.entry.get(key) is None:
+        return None
+    path = finder.find(frame.entry[key], f"{frame.where} {key}")
+    if not is_file(path):
+        raise FormatError(
+            f"{frame.where} names the {key} {path}, which is missing.",
+            hint=f"Copy the file, or take {key} out of the list.")
+    return path
+
+
+def _unit(frame: _Frame) -> float:
+    unit = read_number(frame.entry, "depth_unit_scale_factor", frame.where)
+    if unit is not None and unit <= 0:
+        raise FormatError(
+            f"{frame.where} has depth_unit_scale_factor = {unit:g}; needed is one above 0.",
+            hint=_HINT)
+    return _DEPTH_UNIT if unit is None else unit
+
+
+def _read_points(
+    file: Path,
+) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None, tuple[str, ...]]:
+    """Returns nerfstudio's sparse points and their colours, and notices."""
+    if not file.is_file():
+        return None, None, ()
+    name = read_json(file, hint=_HINT, finite=False).get("ply_file_path")
+    if name is None:
+        return None, None, ()
+    path = resolve_inside(file.parent, name, f"{file}, ply_file_path,")
+    if not is_file(path):
+        return None, None, (f"its points {name} are missing",)
+    # Late, for it imports torch, which nothing else here needs.
+    from recon_cli.splats.ply import read_ply_points
+
+    points, colors = read_ply_points(path)
+    if colors is None:
+        return points, np.full(points.shape, 128, np.uint8), (f"its points {name} have no colours",)
+    return points, colors, ()
+
+
+def write_transforms(
+    path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = (),
+    points: str | None = None,
+) -> None:
+    """Writes the cameras of images, by paths below the folder of the file, whole or not at all.
+
+    Intrinsics that all cameras share are written once. With held-out paths the lists
+    train_filenames, val_filenames and test_filenames are written; the last two are those images,
+    because nerfstudio requires both. `points` is the name of a point cloud beside the file, in the
+    same world, where nerfstudio starts Gaussians. InputError if there are no views; ValueError if
+    a path leaves the folder, appears twice, or is held out but no view.
+    """
+    if not views:
+        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+    names = [name for name, _ in views]
+    for name in names:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise ValueError(f"{name} is no path below the folder of {path}")
+    if len(set(names)) < len(names) or not set(held_out) <= set(names):
+        raise ValueError("duplicate views, or held-out ones that do not exist")
+    inner = [_intrinsics(camera) for _, camera in views]
+    shared = all(intrinsics == inner[0] for intrinsics in inner)
+    value: dict[str, Any] = {"camera_model": "PINHOLE", **(inner[0] if shared else {})}
+    if points is not None:
+        value["ply_file_path"] = points
+    if held_out:
+        test = [name for name in names if name in held_out]
+        value |= {"train_filenames": [name for name in names if name not in held_out],
+                  "val_filenames": test, "test_filenames": test}
+    value["frames"] = [
+        {"file_path": name, **({} if shared else intrinsics),
+         "transform_matrix": pose_from_viewmat(camera.viewmat).tolist()}
+        for (name, camera), intrinsics in zip(views, inner, strict=True)]
+    write_json(path, value)
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    return {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
+            "w": camera.width, "h": camera.height}

@@ -1,1 +1,0 @@
-"""A triangle mesh of the surface that the training views show."""

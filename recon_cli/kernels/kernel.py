@@ -1,0 +1,109 @@
+"""How every kernel is compiled, and where the machine code is kept.
+
+Compiling takes seconds, so the machine code is kept in the user's cache folder. numba stores it by
+pickle, which executes what the file says: the folder must belong to the user alone. Its name holds
+a digest of the CPU, the versions and all sources of kernels/ and render/numba (numba checks only
+the file that a kernel stands in, not what it inlines), so that other code is never loaded. Where
+and when the sources were installed counts too: numba compiles again for another place or time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import stat
+import sys
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+import numba
+from numba.core import config
+
+from recon_cli import machine
+
+logger = logging.getLogger("recon")
+_OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+Compiled = Callable[..., Any]
+unsaved: list[OSError] = []  # why kernels were not kept
+
+
+def kernel(function: Compiled) -> Compiled:
+    """Compiles a function that runs without the GIL and is called from Python; kept on disk."""
+    dispatcher = numba.njit(**_OPTIONS)(function)
+    folder = cache_folder()
+    if folder:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        try:
+            dispatcher.enable_caching()
+        finally:
+            config.CACHE_DIR = before
+        dispatcher._cache.save_overload = partial(_save, dispatcher._cache.save_overload)
+    return dispatcher  # type: ignore[no-any-return]
+
+
+def _save(save: Callable[..., None], signature: Any, machine_code: Any) -> None:
+    """Keeps machine code where there is room for it; without, it serves this run alone."""
+    try:
+        save(signature, machine_code)
+    except OSError as error:
+        if not unsaved:
+            logger.warning(
+                "compiled kernels cannot be kept (%s); they are compiled in every run. Free some "
+                "space, or set RECON_CACHE_DIR to a folder on another disk.", error)
+        unsaved.append(error)
+
+
+def inlined(function: Compiled) -> Compiled:
+    """Compiles a function into every kernel that calls it."""
+    return numba.njit(**_OPTIONS, forceinline=True)(function)  # type: ignore[no-any-return]
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Returns the folder of the machine code; None where there is no place for it."""
+    folder = machine.cache_root() / "kernels" / fingerprint()
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        probe = folder / f".probe-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        logger.warning(
+            "compiled kernels cannot be kept (%s); they are compiled in every run. Set "
+            "RECON_CACHE_DIR to a folder that can be written.", error)
+        return None
+    if not _ours_alone(folder):
+        logger.warning(
+            "%s can be written by others and is not used; kernels are compiled in every run. Set "
+            "RECON_CACHE_DIR to a folder of your own.", folder)
+        return None
+    return folder
+
+
+def fingerprint() -> str:
+    """Returns a digest of all that machine code depends on."""
+    digest = hashlib.sha256()
+    features = config.CPU_FEATURES
+    if features is None:
+        features = llvm.get_host_cpu_features().flatten()
+    for text in (platform.machine(), config.CPU_NAME or llvm.get_host_cpu_name(), features,
+                 sys.version, numba.__version__, llvmlite.__version__):
+        digest.update(text.encode() + b"\0")
+    package = Path(__file__).parents[1]
+    for path in sorted([*package.glob("kernels/*.py"), *package.glob("render/numba/*.py"),
+                        package / "render" / "contract.py"]):
+        digest.update(f"{path}\0{path.stat().st_mtime_ns}\0".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _ours_alone(folder: Path) -> bool:
+    if not hasattr(os, "getuid"):  # Windows keeps the folder inside the user's profile
+        return True
+    status = folder.stat()
+    return status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

@@ -1,0 +1,57 @@
+"""Writing of the mesh and of the plan of its room, and the check of what was written."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.errors import WorkspaceError
+from recon_cli.io.meshes import Mesh, read_mesh, write_mesh
+from recon_cli.room.measures import RoomFrame, measure_room
+from recon_cli.room.mesh import MeshResult
+from recon_cli.room.plan_svg import describe, draw_plan
+from recon_cli.splats.glb import nearest_axes
+from recon_cli.workspace.atomic import write_bytes, write_json
+
+MEASURES = "measures.json"
+_ROUNDING = 1e-6  # of the largest coordinate: float32, and eight digits of text
+
+logger = logging.getLogger("recon")
+
+
+def write_mesh_file(path: Path, result: MeshResult, up: NDArray[np.float64]) -> Path:
+    """Writes a mesh and compares what reads back; a .glb gets the axes of glTF."""
+    axes = nearest_axes(up) if path.suffix == ".glb" else None
+    write_mesh(path, result.mesh, axes=axes)
+    _verify_mesh(path, result.mesh, axes)
+    logger.info("%s: %s", path.name, result.describe())
+    return path
+
+
+def write_plan(
+    out: Path, result: MeshResult, centers: NDArray[np.float64], frame: RoomFrame
+) -> Path:
+    """Writes plan.svg and measures.json; `centers` [C, 3] are the cameras in the exported world."""
+    measures = measure_room(result.mesh, result.planes, centers, frame.up, frame.scale_error)
+    write_json(out / MEASURES, measures.to_json())
+    write_bytes(out / "plan.svg", draw_plan(measures).encode())
+    for line in describe(measures):
+        logger.info("%s", line)
+    return out / "plan.svg"
+
+
+def _verify_mesh(path: Path, mesh: Mesh, axes: NDArray[np.float64] | None) -> None:
+    """Raises WorkspaceError unless a file reads back as this mesh, in the axes of the file."""
+    back = read_mesh(path)
+    vertices = mesh.vertices if axes is None else mesh.vertices @ axes.T
+    size = float(np.abs(vertices).max())
+    same = (np.array_equal(back.faces, mesh.faces) and back.vertices.shape == vertices.shape
+            and np.abs(back.vertices - vertices).max() <= _ROUNDING * size
+            and np.abs(back.colors.astype(int) - mesh.colors).max() <= 1)
+    if not same:
+        raise WorkspaceError(
+            f"{path} reads back as another mesh than was written.",
+            hint="Check the disk, then run `recon export --again`.")

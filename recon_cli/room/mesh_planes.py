@@ -1,0 +1,34 @@
+"""The large planes of a mesh, of which a room is measured: walls, floor and ceiling."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.room.depth_maps import DepthMaps
+from recon_cli.room.planes import Plane, confirm_all, find_planes
+from recon_cli.room.volume import extract, fuse
+
+_COARSE = 2.0  # voxels; a side of those that planes are looked for in
+
+
+def surface_planes(
+    maps: DepthMaps, voxel: float, farthest: float, points: NDArray[np.float64]
+) -> list[tuple[Plane, Plane | None]]:
+    """Returns the large planes of the surface, each with what triangulated points make of it."""
+    band = _COARSE * voxel
+    vertices, faces = extract(fuse(maps, band, farthest))
+    centers, normals, areas = face_geometry(vertices, faces)
+    planes = find_planes(centers, normals, areas, band)
+    return list(zip(planes, confirm_all(planes, centers, points, band), strict=True))
+
+
+def face_geometry(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Returns centres [F, 3], unit normals [F, 3] and areas [F] of the triangles that have one."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    there = lengths > 0
+    return (corners[there].mean(axis=1), normals[there] / lengths[there, None], lengths[there] / 2)

@@ -1,0 +1,99 @@
+"""Codebooks for numbers and palettes for vectors, by seeded k-means."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
+
+from recon_cli.splats.values import Floats
+
+BOOK = 256  # values of a byte
+_SAMPLE = 1 << 16  # numbers or rows that centres are fitted to; more change nothing
+_PAIRS = 1 << 26  # of rows and centres that are compared at a time: 256 MB
+_BOOK_ROUNDS = 20
+_ROUNDS = 10
+_Float = TypeVar("_Float", np.float32, np.float64)
+
+
+def fit_codebook(values: Floats, rng: np.random.Generator) -> Floats:
+    """Returns 256 ascending numbers that represent at least one value.
+
+    Lloyd's algorithm from 128 quantiles and 128 even steps; `rng` draws a sample of many values.
+    """
+    flat = values.ravel().astype(np.float64)  # whose squares neither underflow nor overflow
+    ends = (float(flat.min()), float(flat.max()))
+    if flat.size > _SAMPLE:
+        flat = np.append(rng.choice(flat, _SAMPLE, replace=False), ends)
+    start = np.unique(np.concatenate([
+        np.quantile(flat, np.linspace(0, 1, BOOK // 2)), np.linspace(*ends, BOOK // 2)]))
+    centres = np.sort(_lloyd(flat[:, None], start[:, None], _BOOK_ROUNDS)[:, 0])
+    return np.pad(centres, (0, BOOK - len(centres)), mode="edge").astype(np.float32)
+
+
+def nearest_entries(values: Floats, book: Floats) -> NDArray[np.uint8]:
+    """Returns the index of the nearest number of an ascending codebook for each value."""
+    wide = book.astype(np.float64)
+    return np.searchsorted((wide[1:] + wide[:-1]) / 2, values).astype(np.uint8)
+
+
+def fit_palette(
+    rows: Floats, size: int, rng: np.random.Generator
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Returns at most `size` representative rows [P, D] and the index of that of each row [M].
+
+    Two levels of k-means: about sqrt(size) groups first, then each by itself, with a share of the
+    palette in proportion to its squared error. Duplicate rows count once; `rng` draws the starts.
+    """
+    rows, copies = np.unique(rows, axis=0, return_inverse=True)
+    peak = max(float(np.abs(rows).max()), float(np.finfo(np.float32).tiny))
+    rows = rows / np.float32(peak)  # so that no square overflows
+    groups, errors = _group_rows(rows, max(1, round(math.sqrt(size))), rng)
+    shares = errors / max(errors.sum(), np.finfo(np.float64).tiny)
+    spare = size - len(shares)
+    entries: list[Floats] = []
+    labels = np.zeros(len(rows), np.int64)
+    total = 0
+    for group, share in enumerate(shares):
+        members = np.flatnonzero(groups == group)
+        if not len(members):
+            continue
+        wanted = min(1 + int(share * spare), max(1, _PAIRS // len(members)))
+        centres = _lloyd(rows[members], _choose_starts(rows[members], wanted, rng), _ROUNDS)
+        used, own = np.unique(vq(rows[members], centres)[0], return_inverse=True)
+        entries.append(centres[used])
+        labels[members] = total + own
+        total += len(used)
+    return np.concatenate(entries) * np.float32(peak), labels[copies.ravel()]
+
+
+def _group_rows(
+    rows: Floats, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Returns the group of each row [M] and the squared error of each group."""
+    sample = rows if len(rows) <= _SAMPLE else rows[
+        np.sort(rng.choice(len(rows), _SAMPLE, replace=False))]
+    centres = _lloyd(sample, _choose_starts(sample, count, rng), _ROUNDS)
+    parts = [vq(rows[at:at + _SAMPLE], centres) for at in range(0, len(rows), _SAMPLE)]
+    groups = np.concatenate([part[0] for part in parts]).astype(np.int64)
+    squares = np.concatenate([part[1] for part in parts]).astype(np.float64) ** 2
+    return groups, np.bincount(groups, squares, len(centres)).astype(np.float64)
+
+
+def _choose_starts(rows: Floats, count: int, rng: np.random.Generator) -> Floats:
+    """Returns initial centres: drawn half uniformly, half by squared distance from the mean."""
+    far = ((rows - rows.mean(axis=0)) ** 2).sum(axis=1, dtype=np.float64)
+    weights = far.mean() + far if far.any() else np.ones(len(far))
+    count = min(count, len(rows))
+    return rows[np.sort(rng.choice(len(rows), count, replace=False, p=weights / weights.sum()))]
+
+
+def _lloyd(rows: NDArray[_Float], start: NDArray[_Float], rounds: int) -> NDArray[_Float]:
+    with warnings.catch_warnings():  # a centre without rows keeps its value
+        warnings.simplefilter("ignore", UserWarning)
+        centres, _ = kmeans2(rows, start, iter=rounds, minit="matrix", missing="warn")
+    return np.asarray(centres, rows.dtype)

@@ -1,0 +1,128 @@
+"""Values that other programs write in their own way: found by evidence, converted, and said.
+
+Rows that are not finite are dropped; opacities and scales that are no logits and logarithms are
+recognized by values that no trained scene has as such; positions far from the origin, which float32
+would round by more than a Gaussian is large, are moved to it.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.errors import FormatError
+from recon_cli.scene.splats import TERMS
+from recon_cli.splats.loaded import Origin
+
+_MOST_BAD = 0.5  # of all rows; a file that has more is another one than its header says
+# Fewer Gaussians, or nearly equal opacities, are no evidence of what their numbers mean.
+_ENOUGH, _SPREAD = 50, 0.25
+# Gaussians whose centre is within one size of a place, on the mean: .003 in a trained room, but 45
+# if its sizes are read as logarithms.
+_COVERED = 1.0
+_BULK = 0.9  # share of the Gaussians that determines the size of the scene
+_ROUNDING = 0.1  # of the median Gaussian's size: what moves by more, float32 cannot hold
+_MOST_DEGREE = 10
+FLAT = math.log(1e-6)  # log scale of a flat Gaussian, as SuperSplat sets it
+
+logger = logging.getLogger("recon")
+Columns = dict[str, NDArray[Any]]
+
+
+def drop_not_finite(
+    path: Path, columns: Mapping[str, NDArray[Any]],
+    named: Mapping[str, NDArray[Any]] | None = None,
+) -> Columns:
+    """Returns columns [N, ...] without the rows that hold a NaN or an infinity, with a warning.
+
+    `named` are the same values by the names that the file has for them. FormatError, with the count
+    in each column, if these rows are more than half of all.
+    """
+    with np.errstate(over="ignore"):
+        bad = {name: ~np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
+               for name, value in (named or columns).items()}
+    bad = {name: rows for name, rows in bad.items() if rows.any()}
+    if not bad:
+        return dict(columns)
+    rows = np.logical_or.reduce(list(bad.values()))
+    listed = ", ".join(f"{name} ({found.sum():,})" for name, found in bad.items())
+    if rows.sum() > _MOST_BAD * len(rows):
+        raise FormatError(
+            f"{path} holds values that are not finite in {listed}, in {rows.sum():,} of "
+            f"{len(rows):,} Gaussians.",
+            hint="Export it again from the program it came from.")
+    logger.warning("%s: %s of %s Gaussians are left out: not finite in %s",
+                   path.name, f"{rows.sum():,}", f"{len(rows):,}", listed)
+    return {name: value[~rows] for name, value in columns.items()}
+
+
+def count_terms(path: Path, coefficients: int) -> int:
+    """Returns the terms a channel of a file with that many coefficients of degrees 1 and up.
+
+    FormatError if that many make no degree.
+    """
+    degrees = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(_MOST_DEGREE + 1)}
+    if coefficients not in degrees:
+        raise FormatError(
+            f"{path} has {coefficients} coefficients of spherical harmonics beside the first "
+            "(f_rest); 0, 9, 24, 45 or 72, numbered from 0, make a degree.",
+            hint="Export it again from the program it came from.")
+    warn_of_degree(path, degrees[coefficients])
+    return coefficients // 3
+
+
+def warn_of_degree(path: Path, degree: int) -> None:
+    """Warns if a file is of a higher degree than recon has."""
+    most = len(TERMS) - 1
+    if degree > most:
+        logger.warning("%s: harmonics of degree %d are cut to degree %d, so colours change a "
+                       "little with the view", path.name, degree, most)
+
+
+def undo_activations(path: Path, columns: Columns) -> Columns:
+    """Returns logits and log scales of columns that may hold opacities and sizes instead."""
+    values = columns["logit_opacities"]
+    if len(values) < _ENOUGH:
+        return columns
+    changed = dict(columns)
+    low, high = float(values.min()), float(values.max())
+    opacities = low >= 0 and high <= 1 and high - low >= _SPREAD
+    if opacities:
+        inner = np.clip(values.astype(np.float64), 0.25 / 255, 254.75 / 255)
+        changed["logit_opacities"] = np.log(inner / (1 - inner)).astype(np.float32)
+        logger.warning(
+            "%s: opacities are taken as they are, not as logits: all %s lie between %.3g and %.3g",
+            path.name, f"{len(values):,}", low, high)
+    scales = columns["log_scales"]
+    if scales.min() >= 0 and (opacities or _covers_everything(columns["means"], scales)):
+        changed["log_scales"] = np.log(np.maximum(scales, math.exp(FLAT))).astype(np.float32)
+        logger.warning(
+            "%s: scales are taken as they are, not as logarithms: all lie between %.3g and %.3g",
+            path.name, scales.min(), scales.max())
+    return changed
+
+
+def _covers_everything(means: NDArray[Any], log_scales: NDArray[Any]) -> bool:
+    """Returns whether many Gaussians would cover each place if these were logarithms."""
+    away = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    radius = float(np.quantile(away, _BULK))
+    size = float(np.median(log_scales))
+    return radius > 0 and math.log(len(means)) + 3 * (size - math.log(radius)) > math.log(_COVERED)
+
+
+def find_origin(means: NDArray[Any], log_scales: NDArray[Any]) -> Origin | None:
+    """Returns what to subtract from positions [N, 3]; None if float32 holds them as they are."""
+    middle = np.median(means.astype(np.float64), axis=0)
+    rounding = float(np.spacing(np.float32(np.abs(middle).max()))) / 2
+    size = math.exp(float(np.median(log_scales)))
+    if not _ROUNDING * size < rounding < math.inf:
+        return None
+    whole = np.rint(middle)
+    x, y, z = (float(value) for value in (whole if whole.any() else middle))
+    return Origin((x, y, z), rounding, size, rounded=means.dtype == np.float32)

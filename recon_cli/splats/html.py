@@ -1,0 +1,202 @@
+"""A page that shows the scene: one .html that needs no other file and no network.
+
+It embeds the scene as .spz, the cameras, and Spark and three.js as they were published (`web/`,
+whose README lists versions and digests). The reader extracts the scene without running the page.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import gzip
+import html
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.errors import FormatError
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+from recon_cli.splats.axes import turn_from
+from recon_cli.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_scene
+from recon_cli.splats.values import read_contents
+from recon_cli.workspace.atomic import write_bytes
+
+View = tuple[str, Camera]
+Z_UP: NDArray[np.float64] = np.array([0.0, 0, 1])
+
+# Files in `web/` by the module name that others import; "recon:" marks relative imports.
+MODULES = {
+    "three": "three.module.min.js",
+    "recon:three.core.min.js": "three.core.min.js",
+    "three/addons/controls/OrbitControls.js": "OrbitControls.js",
+    "three/addons/postprocessing/Pass.js": "Pass.js",
+    "@sparkjsdev/spark": "spark.module.min.js",
+    "harmonics": "harmonics.js",
+    "viewer": "viewer.js",
+}
+LICENCES = ("LICENSE-three.txt", "LICENSE-spark.txt", "LICENSE-fflate.txt")
+_STORED = "rub"  # what the page turns; its own inverse
+_BULK = 0.9  # share of the Gaussians that determines the size of the scene
+_LEVELS_FROM = 500_000  # Gaussians, of which Spark makes levels of detail
+_DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is measured on
+# At five, e^-10 units, the least scale, are .0015 units of the scene: in one of COLMAP, where some
+# ten are a room, less than a millimetre.
+_MOST_HALVINGS = 5
+_DEFAULT_LENS = (1200, 900, 1000.0)  # width, height and focal length in pixels
+
+
+def measure_extent(means: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], float]:
+    """Returns the middle [3] and the radius of most of the centres [N, 3]."""
+    middle = np.median(means.astype(np.float64), axis=0)
+    reach = float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK))
+    return middle, reach or 1.0
+
+
+def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
+    """Returns a camera in front of the scene and a little above it, looking at its middle."""
+    middle, reach = measure_extent(splats.means.detach().cpu().numpy())
+    back = np.array([0.0, -1, 0]) if abs(up[1]) < 0.5 else np.array([0.0, 0, np.sign(up[1])])
+    back -= (back @ up) * up
+    offset = 2.5 * back / np.linalg.norm(back) + 0.5 * up
+    forward = -offset / np.linalg.norm(offset)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (middle + reach * offset)
+    width, height, focal = _DEFAULT_LENS
+    return "", Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
+
+
+def build_page(
+    title: str, scene: str, views: Sequence[View], splats: Splats, up: NDArray[np.float64]
+) -> bytes:
+    """Returns the page, in which `scene` is the element with the Gaussians."""
+    text = Template(_text("page.html")).substitute(
+        title=html.escape(title), scene=scene, views=_views(views, splats, up),
+        licences="\n".join(f"{name}\n{_text(name)}" for name in LICENCES),
+        modules="\n".join(_module(name, file) for name, file in MODULES.items()))
+    return text.encode("utf-8", "replace")  # a file name may hold surrogates
+
+
+def _views(views: Sequence[View], splats: Splats, up: NDArray[np.float64]) -> str:
+    """Returns the element with the extent of the scene and the cameras."""
+    means = splats.means.detach().cpu().double().numpy()
+    middle, reach = measure_extent(means)
+    sample = means[::-(-len(means) // _DISTANCE_SAMPLES)]
+    lenses: dict[tuple[float, ...], int] = {}
+    entries = []
+    for name, camera in views:
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        pose = np.hstack([camera.viewmat[:3, :3].T, camera.center[:, None]])
+        entries.append({
+            "name": name, "lens": lenses.setdefault(lens, len(lenses)),
+            "pose": pose.ravel().tolist(), "distance": _distance(sample, camera) or reach})
+    names = ("fx", "fy", "cx", "cy", "width", "height")
+    value = {
+        "up": up.tolist(), "middle": middle.tolist(), "reach": reach,
+        "lod": len(splats) >= _LEVELS_FROM,
+        "lenses": [dict(zip(names, lens, strict=True)) for lens in lenses], "views": entries}
+    # No name can close the element.
+    text = json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f'<script id="views" type="application/json">{text}</script>'
+
+
+def _distance(means: NDArray[np.float64], camera: Camera) -> float:
+    """Returns the median depth of the centres that a camera sees; 0 if it sees none."""
+    x, y, z = camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    visible = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return float(np.median(z[visible])) if visible.any() else 0.0
+
+
+@cache
+def _module(name: str, file: str) -> str:
+    # Level and time are fixed, so that the same files give the same page.
+    packed = gzip.compress(_text(file).encode("utf-8"), 9, mtime=0)
+    return (f'<script type="text/plain" data-module="{html.escape(name)}">'
+            f'{base64.b64encode(packed).decode("ascii")}</script>')
+
+
+def _text(name: str) -> str:
+    return (files("recon_cli.io.splats") / "web" / name).read_text(encoding="utf-8")
+
+
+_OPENED = re.compile(rb'<script id="scene" type="application/octet-stream" '
+                     rb'data-format="([a-z]{1,9})" data-bytes="([0-9]{1,12})"'
+                     rb'(?: data-halvings="([0-9]{1,2})")?>')
+_CLOSED = b"</script>"
+
+
+def write_html(
+    path: Path, splats: Splats, *, title: str = "scene", up: NDArray[np.float64] = Z_UP,
+    views: Sequence[View] = (),
+) -> None:
+    """Writes a page that shows `splats`, whole or not at all.
+
+    Values are quantized as by `write_spz`, but coefficients to 1/128. `up` is a unit vector [3]. A
+    visitor can step through the cameras of `views`; the page opens at the first of them, or in
+    front of the scene. The errors are those of `spz_bytes`.
+    """
+    halvings = _halvings(splats)
+    # beside the scripts size hardly counts
+    packed = spz_bytes(path, turn_from(_STORED, _enlarged(splats, -halvings)), harmonic_step=1,
+                       most_bits=POSITION_BITS + halvings, axes=None)
+    tag = f' data-halvings="{halvings}"' if halvings else ""
+    scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '
+             f'data-bytes="{len(packed)}"{tag}>{base64.b64encode(packed).decode("ascii")}</script>')
+    write_bytes(path, build_page(title, scene, views or [default_view(splats, up)], splats, up))
+
+
+def _halvings(splats: Splats) -> int:
+    """Returns how often the scene is halved until SPZ holds its largest Gaussian."""
+    largest = float(splats.scales.detach().max()) if len(splats) else 0.0
+    if not LARGEST_SCALE < largest < math.inf:
+        return 0
+    return min(_MOST_HALVINGS, math.ceil(math.log2(largest / LARGEST_SCALE)))
+
+
+def _enlarged(splats: Splats, doublings: int) -> Splats:
+    """Returns the scene in another unit: all lengths times two to the power of `doublings`."""
+    if doublings == 0:
+        return splats
+    return replace(splats, means=splats.means * 2.0**doublings,
+                   log_scales=splats.log_scales + doublings * math.log(2))
+
+
+def read_html(path: Path) -> Splats:
+    """Returns the Gaussians in a page of `write_html`, or raises FormatError; no script is run."""
+    data = read_contents(path)
+    matches = list(_OPENED.finditer(data))
+    if len(matches) != 1:
+        raise FormatError(
+            f"{path} holds {len(matches) or 'no'} scenes as `recon export --format html` writes "
+            "them; one is needed.", hint="Give the page itself, not a copy that a browser saved.")
+    start = matches[0].end()
+    end = data.find(_CLOSED, start)
+    if end < 0:
+        raise FormatError(f"{path} ends too early: it is truncated.", hint="Copy the file again.")
+    kind, promised = matches[0][1], int(matches[0][2])
+    if kind != b"spz":
+        raise FormatError(f"{path} holds a scene as {kind.decode('ascii')}; spz can be read.")
+    try:
+        packed = binascii.a2b_base64(data[start:end], strict_mode=True)
+    except binascii.Error as error:
+        raise FormatError(f"{path} is damaged: its scene is no base64 ({error}).") from error
+    if len(packed) != promised:
+        raise FormatError(
+            f"{path} promises a scene of {promised} bytes, but holds {len(packed)}: it is damaged.")
+    stored = spz_scene(path, packed, axes=_STORED).splats
+    return _enlarged(stored, int(matches[0][3] or 0))

@@ -1,0 +1,293 @@
+"""Streamed SOG of PlayCanvas, version 1: levels of detail in pieces, of which a viewer loads some.
+
+A folder holds lod-meta.json and folders of unpacked .sog files. The leaves of a tree of boxes say
+for each level which Gaussians of which file lie in them: the viewer takes a level for each leaf by
+its distance. Level 0 is the scene, each further one has a quarter of the Gaussians.
+Source: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog, read
+together with what splat-transform writes and reads.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recon_cli.scene.splats import Splats, joined, with_rows
+from recon_cli.splats.coarsen import coarsen
+from recon_cli.splats.sog import (
+    META,
+    SHARING,
+    Unpacked,
+    encode_webp,
+    pack_splats,
+    path_escapes,
+    read_files,
+)
+from recon_cli.splats.values import Floats, UntrustedFile, normalize_quats
+from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.layout import remove
+
+LOD_META = "lod-meta.json"
+_VERSION = 1
+_QUARTER = 4  # how many times fewer Gaussians the next level has
+_LEVELS = 6  # at most
+_COARSEST = 30_000  # Gaussians of a level that needs no further one: they are loaded in a moment
+_LEAF = 30_000  # Gaussians of level 0 in a leaf, at most
+_FILE = 120_000  # from which a file of one level is full: half a second on a slow line
+_SIGMAS = 3.0  # of a Gaussian within the box of its leaf
+_META_LIMIT = 64 << 20  # bytes
+_FILES_LIMIT = 1 << 16
+_FOLDER = re.compile(r"\d+_\d+")  # a file of a level: {level}_{number}
+
+
+def make_levels(splats: Splats) -> list[Splats]:
+    """Returns the scene, and versions of ever fewer Gaussians."""
+    levels = [splats]
+    while len(levels[-1]) > _COARSEST and len(levels) < _LEVELS:
+        levels.append(coarsen(levels[-1], len(levels[-1]) // _QUARTER))
+    return levels
+
+
+def write_lod(
+    path: Path, levels: Sequence[Splats], *, seed: int = 0, sharing: int = SHARING[0]
+) -> None:
+    """Writes levels of a scene, the finest first, to `path`, a file named lod-meta.json.
+
+    The files of the levels lie beside it, and replace those of another scene. `seed` and `sharing`
+    are those of `write_sog`. FormatError if there are no Gaussians, or a value is not finite.
+    """
+    folder = path.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)  # first of all, as it names the others
+    for other in [*folder.glob("*_*")]:
+        if _FOLDER.fullmatch(other.name) and other.is_dir():
+            remove(other)
+    tree = _Tree.of(levels[0].means.detach().cpu().numpy())
+    names: list[str] = []
+    for level, splats in enumerate(levels):
+        leaf = tree.leaves_of(splats.means.detach().cpu().numpy())
+        tree.grow(leaf, splats)
+        for part in _split(np.bincount(leaf, minlength=tree.count)):
+            chosen = np.flatnonzero(np.isin(leaf, part))
+            piece = _all_colored(splats.select(torch.from_numpy(chosen)))
+            meta, images = pack_splats(piece, leaf[chosen], seed=seed, sharing=sharing)
+            name = f"{level}_{sum(other.startswith(f'{level}_') for other in names)}"
+            target = folder / name
+            target.mkdir(parents=True)
+            for image, pixels in images.items():
+                (target / image).write_bytes(encode_webp(pixels))
+            (target / META).write_text(_json(meta), encoding="utf-8")
+            tree.place(level, len(names), leaf[chosen])
+            names.append(f"{name}/{META}")
+    counts = [len(splats) for splats in levels]
+    write_bytes(path, _json({
+        "version": _VERSION, "asset": {"generator": "recon"}, "count": sum(counts),
+        "counts": counts, "lodLevels": len(levels), "filenames": names,
+        "tree": tree.to_json()}).encode())
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False)
+
+
+def _all_colored(splats: Splats) -> Splats:
+    """Returns Gaussians that all have coefficients, if any has."""
+    rest = splats.sh_rest
+    if len(rest):
+        rest = with_rows(rest, len(splats))
+    return Splats.of({**splats.parameters(), "sh_rest": rest})
+
+
+def _split(counts: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Yields the leaves of each file, neighbours in the tree, from the Gaussians of each leaf."""
+    part: list[int] = []
+    for leaf in np.flatnonzero(counts):
+        part.append(int(leaf))
+        if counts[part].sum() >= _FILE:
+            yield np.array(part)
+            part = []
+    if part:
+        yield np.array(part)
+
+
+@dataclass
+class _Node:
+    """A box that is cut at a coordinate of an axis, or a leaf."""
+
+    leaf: int = -1  # its number; -1 for what is cut
+    axis: int = 0
+    cut: float = 0.0
+    children: tuple[_Node, ...] = ()
+
+
+class _Tree:
+    """Leaves with about equally many Gaussians, cut along their longer sides."""
+
+    def __init__(self, root: _Node, count: int) -> None:
+        self.root, self.count = root, count
+        self._low = np.full((count, 3), np.inf)
+        self._high = np.full((count, 3), -np.inf)
+        # of each leaf, by level: [file, offset, count]
+        self._parts: list[dict[str, dict[str, int]]] = [{} for _ in range(count)]
+
+    @classmethod
+    def of(cls, means: Floats) -> _Tree:
+        """Returns the tree of centres [N, 3]."""
+        leaves = 0
+
+        def build(rows: NDArray[np.int64]) -> _Node:
+            nonlocal leaves
+            values = means[rows]
+            # most of them decide: a few far ones, seen through windows, would cut nothing else
+            low, high = np.quantile(values, (0.01, 0.99), axis=0)
+            axis = int((high - low).argmax())
+            cut = float(np.median(values[:, axis]))
+            below = values[:, axis] < cut
+            if len(rows) <= _LEAF or not below.any():
+                leaves += 1
+                return _Node(leaves - 1)
+            children = build(rows[below]), build(rows[~below])
+            return _Node(axis=axis, cut=cut, children=children)
+
+        root = build(np.arange(len(means)))
+        return cls(root, leaves)
+
+    def leaves_of(self, means: Floats) -> NDArray[np.int64]:
+        """Returns the leaf of each centre [N, 3]."""
+        found = np.empty(len(means), np.int64)
+        open_nodes = [(self.root, np.arange(len(means)))]
+        while open_nodes:
+            node, rows = open_nodes.pop()
+            if node.leaf >= 0:
+                found[rows] = node.leaf
+                continue
+            below = means[rows, node.axis] < node.cut
+            open_nodes += zip(node.children, (rows[below], rows[~below]), strict=True)
+        return found
+
+    def grow(self, leaf: NDArray[np.int64], splats: Splats) -> None:
+        """Makes the boxes hold Gaussians in their leaves [N]."""
+        quats = normalize_quats(splats.quats.detach().cpu().float().numpy())
+        axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+        axes *= splats.scales.detach().cpu().numpy()[:, None]
+        reach = _SIGMAS * np.sqrt(np.square(axes).sum(axis=2))
+        means = splats.means.detach().cpu().numpy().astype(np.float64)
+        np.minimum.at(self._low, leaf, means - reach)
+        np.maximum.at(self._high, leaf, means + reach)
+
+    def place(self, level: int, file: int, leaf: NDArray[np.int64]) -> None:
+        """Notes where the Gaussians of a file are: those of a leaf follow each other."""
+        numbers, counts = np.unique(leaf, return_counts=True)
+        starts = np.cumsum(counts) - counts
+        for number, start, count in zip(numbers, starts, counts, strict=True):
+            self._parts[number][str(level)] = {
+                "file": file, "offset": int(start), "count": int(count)}
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the tree as lod-meta.json holds it."""
+        def describe(node: _Node) -> tuple[dict[str, Any], NDArray[np.float64]]:
+            if node.leaf >= 0:
+                box = np.stack([self._low[node.leaf], self._high[node.leaf]])
+                return {"bound": _bound(box), "lods": self._parts[node.leaf]}, box
+            parts, boxes = zip(*map(describe, node.children), strict=True)
+            stacked = np.stack(boxes)
+            box = np.stack([stacked[:, 0].min(axis=0), stacked[:, 1].max(axis=0)])
+            return {"bound": _bound(box), "children": list(parts)}, box
+
+        return describe(self.root)[0]
+
+
+def _bound(box: NDArray[np.float64]) -> dict[str, list[float]]:
+    return {"min": box[0].tolist(), "max": box[1].tolist()}
+
+
+def read_lod(path: Path) -> Splats:
+    """Returns the Gaussians of the finest level of a lod-meta.json, and those of its environment.
+
+    FormatError if a file is missing, damaged, or does not hold what it promises.
+    """
+    index = _Index(path)
+    wanted: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for file, offset, count in index.finest():
+        wanted[file].append((offset, count))
+    parts = []
+    for file, ranges in sorted(wanted.items()):
+        piece = read_files(Unpacked(index.file(file)))
+        ranges.sort()
+        ends = [0, *(offset + count for offset, count in ranges)]
+        if ends[-1] > len(piece) or any(
+                offset < end for (offset, _), end in zip(ranges, ends, strict=False)):
+            raise index.error(
+                f"Gaussians of {index.names[file]} twice or beyond its {len(piece)}")
+        rows = np.concatenate([np.arange(offset, offset + count) for offset, count in ranges])
+        parts.append(piece.select(torch.from_numpy(rows)))
+    if index.environment is not None:
+        parts.append(read_files(Unpacked(index.environment)))
+    if not parts:
+        raise index.error("a tree without Gaussians")
+    degree = max(part.sh_degree for part in parts)
+    return joined([part.with_degree(degree) for part in parts])[0]
+
+
+class _Index(UntrustedFile):
+    """An open lod-meta.json; every method raises FormatError if it holds not what it promises."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, b"{", LOD_META)
+        if len(self.data) > _META_LIMIT:
+            raise self.error(f"more than {_META_LIMIT >> 20} MB")
+        self._meta = self.json_object(self.data)
+        # files of before version 1 have no number
+        self.whole(self._meta, "version", _VERSION, _VERSION, default=_VERSION)
+        names = self._meta.get("filenames")
+        if not isinstance(names, list) or len(names) > _FILES_LIMIT or not all(
+                isinstance(name, str) for name in names):
+            raise self.error(f"filenames = {names!r:.40}; needed is a list of names")
+        self.names: list[str] = names
+        environment = self._meta.get("environment")
+        self.environment = None if not environment else self._path(environment)
+
+    def file(self, number: int) -> Path:
+        """Returns the meta.json of a file of Gaussians."""
+        return self._path(self.names[number])
+
+    def _path(self, name: object) -> Path:
+        if not isinstance(name, str) or path_escapes(name) or Path(name).name != META:
+            raise self.error(f"the name {name!r:.80}; needed is a {META} in a folder beside it")
+        return self.path.parent / name
+
+    def finest(self) -> Iterator[tuple[int, int, int]]:
+        """Yields (file, offset, count) of the finest level of each leaf."""
+        open_nodes = [self._meta.get("tree")]
+        while open_nodes:
+            node = open_nodes.pop()
+            if not isinstance(node, dict):
+                raise self.error(f"the node {node!r:.40} of a tree")
+            children, lods = node.get("children", []), node.get("lods", {})
+            if not isinstance(children, list) or not isinstance(lods, dict):
+                raise self.error("a node of a tree without a list of children or levels")
+            open_nodes += reversed(children)
+            if lods:
+                part = lods[min(lods, key=self._level)]
+                if not isinstance(part, dict):
+                    raise self.error(f"the level {part!r:.40} of a leaf")
+                yield (self.whole(part, "file", 0, len(self.names) - 1),
+                       self.whole(part, "offset", 0, 1 << 31),
+                       self.whole(part, "count", 1, 1 << 31))
+
+    def _level(self, name: str) -> int:
+        if not name.isdecimal():
+            raise self.error(f"the level {name!r:.40} of a leaf")
+        return int(name)
+
+

@@ -1,0 +1,228 @@
+"""Records that stages leave for others, besides their summaries.
+
+Ingest writes frames.json, and poses.json with points.safetensors of a data set with poses; import
+writes import.json beside the scene. A masked frame has a mask of its name in masks/: 8-bit gray,
+255 where a pixel counts, 0 where features, training and scores ignore it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from recon_cli.errors import FormatError, ReconError
+from recon_cli.scene.camera import Lens, make_lens
+from recon_cli.workspace import atomic
+from recon_cli.workspace.summaries import JsonRecord
+
+FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
+AGAIN = "Run `recon ingest --again`."
+POSES, POINTS = "poses.json", "points.safetensors"
+_IMPORT = "import.json"
+NEEDS_VIEWS_HINT = (
+    "Run `recon ingest CAPTURE` and `recon sfm` in this workspace, then `recon import` again.")
+
+
+@dataclass(frozen=True)
+class Frame(JsonRecord):
+    """One stored frame."""
+
+    name: str  # file name in the folder of frames
+    time_seconds: float | None  # presentation time in the video, None for photos and if unknown
+    source: str  # name of the file that it came from
+    sharpness: float | None  # variance of its Laplacian, None for photos
+    held_out: bool  # used for the score, never for training
+    group: int = 0  # index of the group of frames that share its intrinsics
+    masked: bool = False  # it has a mask of its name in the folder of masks
+
+
+@dataclass(frozen=True)
+class Group(JsonRecord):
+    """Frames that share intrinsics: of one camera with one setting of its lens."""
+
+    name: str  # of their source, for messages
+    width: int  # of the stored frames in pixels, as all below
+    height: int
+    focal_px: float | None = None  # focal length from EXIF, None if unknown
+    lens: Lens | None = None  # known intrinsics, None if they are to be estimated
+
+
+@dataclass(frozen=True)
+class FrameList:
+    """The content of frames.json."""
+
+    # kind of the capture: "video", "photos", "mixed", or the layout of a data set with poses
+    source: str
+    groups: tuple[Group, ...]  # at least one
+    frames: tuple[Frame, ...]  # sorted by name
+
+    def write(self, stage: Path) -> None:
+        """Writes the list into ingest's folder."""
+        atomic.write_json(stage / LIST, dataclasses.asdict(self))
+
+
+def read_frame_list(stage: Path) -> FrameList:
+    """Returns the list of frames in ingest's folder; FormatError if it is missing or damaged."""
+    value = atomic.read_json(stage / LIST, dict, hint=AGAIN)
+    try:
+        frames = tuple(Frame.from_json(frame) for frame in value["frames"])
+        groups = tuple(_group(group) for group in value["groups"])
+        source = value["source"]
+    except (AttributeError, KeyError, TypeError, ValueError, ReconError) as error:
+        raise FormatError(f"{stage / LIST} is not a list of frames.", hint=AGAIN) from error
+    if not isinstance(source, str) or not groups or not all(
+            0 <= frame.group < len(groups) and Path(frame.name).name == frame.name
+            for frame in frames):
+        raise FormatError(
+            f"{stage / LIST} is damaged: it names files elsewhere, or groups that are missing.",
+            hint=AGAIN)
+    return FrameList(source, groups, frames)
+
+
+def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[str]:
+    """Returns the runs of frames in a row that have one of these names, with their seconds.
+
+    A run ends with its video; where there are several videos, each is named.
+    """
+    videos = {frame.source for frame in frames if frame.time_seconds is not None}
+    runs = itertools.groupby(frames, key=lambda frame: (
+        frame.name in names, frame.source if frame.source in videos else ""))
+    stretches = []
+    for (named, video), run in runs:
+        if not named:
+            continue
+        stretch = list(run)
+        first, last = stretch[0], stretch[-1]
+        text = first.name if first is last else f"{first.name} to {last.name}"
+        if first.time_seconds is not None and last.time_seconds is not None:
+            seconds = (f"{first.time_seconds:.1f}" if first is last
+                       else f"{first.time_seconds:.1f} to {last.time_seconds:.1f}")
+            text += f" ({seconds} s{f' of {video}' if len(videos) > 1 else ''})"
+        stretches.append(text)
+    return stretches
+
+
+def _group(value: dict[str, Any]) -> Group:
+    lens, group = value["lens"], Group.from_json({**value, "lens": None})
+    if lens is None:
+        return group
+    return dataclasses.replace(group, lens=make_lens(
+        lens["model"], lens["width"], lens["height"], lens["params"], "the list of frames"))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPoses:
+    """Poses that came with a data set."""
+
+    # [4, 4] float64 world to camera by frame name; OpenCV axes
+    viewmats: Mapping[str, NDArray[np.float64]]
+    metric: bool  # the world's unit is the metre
+    # [P, 3] float64 initial points in the same world, None without points
+    points: NDArray[np.float64] | None = None
+    colors: NDArray[np.uint8] | None = None  # [P, 3] uint8 RGB of the points
+
+    def write(self, stage: Path) -> None:
+        """Writes both files into ingest's folder."""
+        atomic.write_json(stage / POSES, {
+            "metric": self.metric, "points": self.points is not None,
+            "viewmats": {name: matrix.tolist() for name, matrix in self.viewmats.items()}})
+        if self.points is not None and self.colors is not None:
+            with atomic.replacing(stage / POINTS) as temporary:
+                save_file({"points": np.ascontiguousarray(self.points),
+                           "colors": np.ascontiguousarray(self.colors)}, temporary)
+
+
+def read_poses(path: Path) -> KnownPoses:
+    """Returns what `KnownPoses.write` wrote to poses.json; FormatError if a file is damaged."""
+    value = atomic.read_json(path, dict, hint=AGAIN)
+    try:
+        viewmats = {
+            name: np.array(matrix, np.float64).reshape(4, 4)
+            for name, matrix in value["viewmats"].items()}
+        if not all(np.isfinite(matrix).all() for matrix in viewmats.values()):
+            raise ValueError("a pose that is not finite")
+        if not value["points"]:
+            return KnownPoses(viewmats, bool(value["metric"]))
+        tensors = load_file(path.with_name(POINTS))
+        return KnownPoses(viewmats, bool(value["metric"]), tensors["points"], tensors["colors"])
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError, OSError,
+            SafetensorError) as error:
+        raise FormatError(f"{path} holds no poses.", hint=AGAIN) from error
+
+
+def choose_held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:
+    """Returns which of all frames are held out for the score.
+
+    `holdout` is (kind, a, b) of `config.stages.parse_holdout`: each a-th by name from the first on,
+    the share a to b of the names in order, or none.
+    """
+    ordered = sorted(names)
+    kind, a, b = holdout
+    if kind == "every":
+        return frozenset(ordered[::int(a)])
+    if kind == "segment":
+        return frozenset(ordered[round(a * len(ordered)):round(b * len(ordered))])
+    return frozenset()
+
+
+def prepare_frames_folder(stage: Path) -> Path:
+    """Creates the folder of frames in a stage's folder and clears what a killed run left."""
+    folder = stage / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic.clear_leftovers(stage)
+    return folder
+
+
+@dataclass(frozen=True)
+class ImportRecord(JsonRecord):
+    """What is known about an imported scene."""
+
+    file: str  # name of the file that it was read from
+    format: str  # of the file, by its name in `io.splats.registry`
+    sha256: str  # of the file
+    gaussians: int  # count
+    sh_degree: int  # of the colours
+    z_up: bool  # up is z in the file; else it is -y. Given or assumed, never measured
+    views: bool  # it was compared with views of this workspace
+    doubt: str = ""  # why it may not be in their frame, as a sentence; empty if it fits
+    y_up: bool = False  # up is y in the file
+    antialiased: bool = False  # the file says that it was trained with antialiasing
+    origin: tuple[float, ...] | None = None  # [3] that was subtracted from its positions
+
+    def up(self) -> NDArray[np.float64]:
+        """Returns the unit vector [3] that is taken for up where there are no views."""
+        return np.array([0.0, 0, 1] if self.z_up else [0.0, 1 if self.y_up else -1, 0])
+
+    def write(self, folder: Path) -> None:
+        """Writes it into the folder of the scene."""
+        atomic.write_json(folder / _IMPORT, self.to_json())
+
+    def warnings(self) -> list[str]:
+        """Returns the caveats of every score of this scene."""
+        return [*([self.doubt] if self.doubt else []),
+                f"the scene was imported from {self.file}: whoever trained it may have trained on "
+                "the held-out views too"]
+
+    @staticmethod
+    def read(folder: Path) -> ImportRecord | None:
+        """Returns the record of the scene in a folder; None if it was trained here.
+
+        FormatError if the file is damaged, ManifestError if it is of another version.
+        """
+        path = folder / _IMPORT
+        return ImportRecord.from_json(atomic.read_json(path, dict)) if path.exists() else None
+
+
+def has_views(folders: Mapping[str, Path]) -> bool:
+    """Returns whether views were trained on or compared with; `folders` are by stage name."""
+    record = ImportRecord.read(folders["train"])
+    return (record is None or record.views) and "sfm" in folders

@@ -1,0 +1,108 @@
+"""Poses and depth of other programs are recognised by the files that those write."""
+
+import json
+import sqlite3
+
+import numpy as np
+import pytest
+
+from recon_cli.capture.foreign import FOREIGN, find_foreign, find_lists, recognise_file
+
+METASHAPE = ('<?xml version="1.0"?><document version="2.0.0"><chunk><cameras>'
+             '<camera id="0" label="a"/></cameras></chunk></document>')
+REALITY = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\na.jpg,0,0,0,0,0,0,18\n"
+RECORD3D = json.dumps({"frameTimestamps": [0.5] * 4000, "K": [1] * 9, "poses": [[0] * 7]})
+FILES = {
+    "keyframes/cameras/1.json": ('{"t_00": 1, "fx": 3}', "Polycam"),
+    "metadata.json": (RECORD3D, "Record3D"),
+    "metadata": (RECORD3D, "Record3D"),
+    "odometry.csv": ("timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner"),
+    "frame_00001.json": ('{"cameraPoseARFrame": [1]}', "3D Scanner App"),
+    "lowres_wide.traj": ("0 0 0 0 0 0 0\n", "ARKitScenes"),
+    "rtabmap_camera_poses.txt": ("#timestamp x y z qx qy qz qw id\n", "RTAB-Map"),
+    "left_camera_mruk_intrinsics.json": ("{}", "Quest"),
+    "cameras.xml": (METASHAPE, "Metashape"),
+    "cams.csv": (REALITY, "RealityScan"),
+    "a.xmp": ("<xcr:Rotation>1 0 0</xcr:Rotation>", "RealityScan"),
+    "blocks.xml": ("<BlocksExchange version='2.1'/>", "ContextCapture"),
+    "bundle.out": ("# Bundle file v0.3\n0 0\n", "Bundler"),
+    "reconstruction.json": ('[{"shots": {}}]', "OpenSfM"),
+    "odm_report/shots.geojson": ("{}", "OpenDroneMap"),
+    "cameras.sfm": ('{"views": [], "poses": []}', "Meshroom"),
+    "sfm_data.json": ('{"views": [], "extrinsics": []}', "OpenMVG"),
+    "scene.nvm": ("NVM_V3\n", "VisualSFM"),
+    "p_calibrated_external_camera_parameters.txt": ("", "Pix4D"),
+    "cams/00000000_cam.txt": ("extrinsic\n", "MVSNet"),
+    "cameras.json": ("[]", "camera poses, by its name"),
+    "frames.json": ('{"frames": [{"transform_matrix": []}]}', "transforms.json"),
+    "trajectory.txt": ("0 0 0\n", "camera poses, by its name"),
+    "dense/0/cameras.bin": ("", "COLMAP"),
+}
+
+
+def put(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_a_program_leaves_is_recognised_and_named(tmp_path, name):
+    text, words = FILES[name]
+    put(tmp_path / name, text)
+    (found,) = find_foreign(tmp_path)
+    assert words in found.row.words
+    assert words in found.notice(tmp_path)
+    assert found.row.carries in found.notice(tmp_path)
+
+
+def test_files_without_text_are_recognised_too(tmp_path):
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((2, 17)))
+    with sqlite3.connect(tmp_path / "walk.db") as database:
+        database.execute("CREATE TABLE Node (id INTEGER)")
+        database.execute("CREATE TABLE Link (id INTEGER)")
+    database.close()
+    assert [found.row.words for found in find_foreign(tmp_path)] == [
+        "a database of RTAB-Map", "the cameras of an LLFF scene"]
+
+
+def test_the_command_that_converts_it_names_its_file(tmp_path):
+    put(tmp_path / "cameras.xml", METASHAPE)
+    (found,) = find_foreign(tmp_path)
+    assert (f"ns-process-data metashape --data {tmp_path} --xml {tmp_path / 'cameras.xml'} "
+            "--output-dir SCENE") in found.notice(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("notes.xml", "<notes/>"), ("prices.csv", "name,price\n"), ("metadata.json", '{"K": 1}'),
+    ("report.json", "{}"), ("readme.txt", "hello")])
+def test_other_files_are_not_taken_for_poses(tmp_path, name, text):
+    put(tmp_path / name, text)
+    assert find_foreign(tmp_path) == []
+    assert recognise_file(tmp_path / name) is None
+
+
+def test_hidden_files_are_not_looked_at(tmp_path):
+    put(tmp_path / ".hidden.nvm", "NVM_V3")
+    assert find_foreign(tmp_path) == []
+
+
+def test_a_file_is_recognised_by_itself(tmp_path):
+    put(tmp_path / "any.xml", METASHAPE)
+    put(tmp_path / "cameras.json", "[]")
+    put(tmp_path / "odometry walk.mp4", "")
+    found = [recognise_file(path) for path in sorted(tmp_path.iterdir())]
+    assert [one and one.row.words for one in found] == [
+        "the cameras of Agisoft Metashape", "camera poses, by its name", None]
+
+
+def test_a_text_that_lists_the_pictures_is_found_whoever_wrote_it(tmp_path):
+    names = [f"IMG_{index}.jpg" for index in range(6)]
+    put(tmp_path / "angles.txt", "".join(f"{name} 1.5 2.5\n" for name in names[:4]))
+    put(tmp_path / "best.txt", names[0])
+    assert find_lists(tmp_path, names, known=()) == [tmp_path / "angles.txt"]
+    assert find_lists(tmp_path, names, known=[tmp_path / "angles.txt"]) == []
+
+
+def test_every_row_says_what_is_lost():
+    assert all(row.words and row.carries and row.patterns for row in FOREIGN)
+    assert len({row.words for row in FOREIGN}) == len(FOREIGN)

@@ -1,0 +1,67 @@
+from pathlib import PurePosixPath
+
+import posed_sets
+import pytest
+
+from recon_cli.capture.mask_files import mask_folders, match_masks
+from recon_cli.datasets.layouts import read_posed
+
+
+def touch(*paths):
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def matched(folder, *images):
+    masks, unused = match_masks(folder, {image: PurePosixPath(image) for image in images})
+    return {image: mask.relative_to(folder).as_posix() for image, mask in masks.items()}, unused
+
+
+def test_masks_have_the_names_of_their_images_with_a_suffix_or_instead_of_it(tmp_path):
+    touch(tmp_path / "a.png", tmp_path / "b.jpg.png", tmp_path / "c.jpg", tmp_path / "D.JPG",
+          tmp_path / "lost.png", tmp_path / "notes.txt")
+    assert matched(tmp_path, "a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg") == (
+        {"a.jpg": "a.png", "b.jpg": "b.jpg.png", "c.jpg": "c.jpg", "d.jpg": "D.JPG"},
+        ["lost.png"])
+
+
+def test_masks_of_images_in_folders_lie_in_such_folders(tmp_path):
+    touch(tmp_path / "x" / "0.png", tmp_path / "1.png", tmp_path / "2.png")
+    found, unused = matched(tmp_path, "x/0.jpg", "y/0.jpg", "y/1.jpg", "x/2.jpg", "y/2.jpg")
+    assert found == {"x/0.jpg": "x/0.png", "y/1.jpg": "1.png"}
+    assert unused == ["2.png"]  # of which of the two?
+
+
+def test_a_folder_of_masks_may_be_called_so_in_any_case(tmp_path):
+    for name in ("Mask", "depth"):
+        (tmp_path / name).mkdir()
+    assert mask_folders(tmp_path) == [tmp_path / "Mask"]
+    assert mask_folders(tmp_path / "gone") == []
+
+
+MAKERS = {
+    "replica": (posed_sets.make_replica, "results", "frame000001"),
+    "scannet": (posed_sets.make_scannet, "color", "2"),
+    "7scenes": (posed_sets.make_seven_scenes, ".", "frame-000000.color"),
+    "tum": (posed_sets.make_tum, "rgb", "1"),
+    "transforms": (posed_sets.make_transforms, "images", "0001"),
+}
+
+
+@pytest.mark.parametrize("layout", MAKERS)
+def test_masks_by_stem_are_found_in_data_sets_of_every_layout(tmp_path, layout):
+    make, _, stem = MAKERS[layout]
+    make(tmp_path)
+    touch(tmp_path / "masks" / f"{stem}.png", tmp_path / "masks" / "lost.png")
+    posed = read_posed(tmp_path)
+    assert [image.path.stem for image in posed.images if image.mask] == [stem]
+    assert any("1 of its images have masks" in notice for notice in posed.notices)
+    assert any("without an image are left out: lost.png" in notice for notice in posed.notices)
+
+
+def test_where_no_mask_fits_the_right_name_is_told(tmp_path):
+    posed_sets.make_transforms(tmp_path)
+    touch(tmp_path / "masks" / "mask_0.png")
+    assert any("that of 0000.png must be called 0000.png.png or 0000.png" in notice
+               for notice in read_posed(tmp_path).notices)

@@ -1,0 +1,244 @@
+"""SPZ: each parameter within its step, axes turned, every version read, bombs and lies refused."""
+
+import gzip
+import struct
+
+import numpy as np
+import pytest
+import torch
+from splat_cases import N, edge_splats, few, greatest, plain, rotation_error, unit
+
+from recon_cli.errors import FormatError
+from recon_cli.scene.harmonics import basis_rest
+from recon_cli.splats.spz import load_spz, read_spz, write_spz
+
+MIB = 1 << 20
+STEP = 1 / 64  # of harmonics as they are written: every other of the 256 numbers of the format
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize(("degree", "colored"), [(0, N), (1, N), (2, 1), (3, N), (3, 300)])
+def test_each_parameter_is_within_half_a_step(tmp_path, version, degree, colored):
+    splats = edge_splats(degree, colored)
+    write_spz(tmp_path / "a.spz", splats, version=version)
+    back = read_spz(tmp_path / "a.spz")
+    assert len(back) == N
+    assert back.sh_degree == degree
+    assert greatest(back.means, splats.means) <= 0.5 / 4096 + 1e-9
+    assert greatest(back.log_scales, splats.log_scales) <= 0.5 / 16 + 1e-6
+    assert greatest(back.opacities, splats.opacities) <= 0.5 / 255 + 1e-7
+    assert greatest(back.sh_dc, splats.sh_dc) <= 0.5 / 255 / 0.15 + 1e-6
+    if degree:
+        assert len(back.sh_rest) == colored
+        assert greatest(back.sh_rest, splats.sh_rest) <= 0.5 * STEP + 1e-7
+    # Three components are off by half a step d at most. The largest, m = sqrt(1 - a^2 - b^2 - c^2),
+    # is off by (a + b + c) d / m at most, and no component is larger than m.
+    step = np.sqrt(0.5) / 511
+    assert rotation_error(back, splats) <= 3 * 0.5 * step + 2 * step**2
+
+
+def test_versions_hold_the_same_values(tmp_path):
+    write_spz(tmp_path / "3.spz", edge_splats(), version=3)
+    write_spz(tmp_path / "4.spz", edge_splats(), version=4)
+    three, four = read_spz(tmp_path / "3.spz"), read_spz(tmp_path / "4.spz")
+    for name, value in three.parameters().items():
+        assert torch.equal(value, getattr(four, name)), name
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_bytes_stay_when_a_file_is_read_and_written_again(tmp_path, version):
+    write_spz(tmp_path / "a.spz", edge_splats(), version=version)
+    once = read_spz(tmp_path / "a.spz")
+    write_spz(tmp_path / "b.spz", once, version=version)
+    again = read_spz(tmp_path / "b.spz")
+    for name, value in once.parameters().items():
+        if name != "quats":  # two components of one size may change places
+            assert torch.equal(value, getattr(again, name)), name
+    assert rotation_error(once, again) <= 2e-3
+
+
+def test_the_values_in_the_file_are_those_of_the_scene(tmp_path):
+    """As splat-transform, Spark and Niantic's ply_to_spz write them: nothing is turned."""
+    splats = few(4)
+    splats.means[:] = torch.tensor([1.0, 2.0, 4.0])
+    splats.quats[:] = torch.tensor([0.8, 0.1, -0.3, 0.5])
+    write_spz(tmp_path / "a.spz", splats)
+    body = np.frombuffer(plain(tmp_path / "a.spz"), np.uint8)[16:]
+    places, harmonics = body[:9], body[4 * 20:4 * 65].reshape(4, 15, 3)
+    wide = np.zeros((3, 4), np.uint8)
+    wide[:, :3] = places.reshape(3, 3)
+    assert ((wide.view("<i4")[:, 0] << 8 >> 8) / 4096).tolist() == [1, 2, 4]
+    assert np.abs((harmonics[0] - 128.0) / 128 - splats.sh_rest[0].numpy()).max() <= 0.5 * STEP
+    # The largest component w is left out (3 of xyzw); x, y and z keep their sign.
+    word = int(body[4 * 16:4 * 17].view("<u4")[0])
+    fields = [word >> shift & 1023 for shift in (20, 10, 0)]
+    assert word >> 30 == 3
+    signs = [-1 if field & 512 else 1 for field in fields]
+    sizes = [(field & 511) / 511 * np.sqrt(0.5) for field in fields]
+    length = np.linalg.norm([0.8, 0.1, 0.3, 0.5])
+    assert signs == [1, -1, 1]
+    assert np.allclose(sizes, np.array([0.1, 0.3, 0.5]) / length, atol=1e-3)
+
+
+def test_version_2_is_version_3_with_bytes_of_rotations(tmp_path):
+    splats = edge_splats()
+    for version in (2, 3):
+        write_spz(tmp_path / f"{version}.spz", splats, version=version)
+    two, three = read_spz(tmp_path / "2.spz"), read_spz(tmp_path / "3.spz")
+    assert plain(tmp_path / "2.spz")[4] == 2
+    for name, value in three.parameters().items():
+        if name != "quats":
+            assert torch.equal(getattr(two, name), value), name
+    # With d = sqrt(3) / 255 the most by which (x, y, z) is off, w^2 is off by 2 d + d^2 at most,
+    # and so w by the root of that, or by 1.05 d / w where w is not small.
+    apart = torch.minimum(*(
+        (unit(two.quats) - sign * unit(splats.quats)).norm(dim=1) for sign in (1, -1)))
+    d, w = np.sqrt(3) / 255, unit(splats.quats)[:, 0].abs()
+    assert apart.max() <= np.sqrt(2 * d + 2 * d**2)
+    assert apart[w > 0.3].max() <= d * np.sqrt(1 + (1.05 / 0.3)**2)
+
+
+def test_rotations_of_version_2_are_bytes_of_x_y_z(tmp_path):
+    splats = few(3, 0)
+    write_spz(tmp_path / "a.spz", splats, axes=None)
+    data = plain(tmp_path / "a.spz")
+    body = data[16:16 + 16 * 3]
+    vectors = np.array([[0, 0, 0], [0.5, -0.5, 0.5], [0, -1, 0]])
+    rotations = np.rint(vectors * 127.5 + 127.5).astype(np.uint8).tobytes()
+    (tmp_path / "b.spz").write_bytes(
+        gzip.compress(b"NGSP" + struct.pack("<I", 2) + data[8:16] + body + rotations))
+    back = read_spz(tmp_path / "b.spz")
+    wanted = np.array([[1, 0, 0, 0], [0.5, 0.5, -0.5, 0.5], [0, 0, -1, 0]])
+    assert np.allclose(back.quats, wanted, atol=1.5 / 127.5)
+    assert torch.equal(back.means, read_spz(tmp_path / "a.spz").means)
+
+
+@pytest.mark.parametrize(("far", "bits"), [(1.0, 12), (2047.9, 12), (2048.0, 11), (32767.9, 8)])
+def test_positions_get_the_bits_that_the_extent_leaves(tmp_path, far, bits):
+    splats = edge_splats(0, far=far)
+    write_spz(tmp_path / "a.spz", splats)
+    assert plain(tmp_path / "a.spz")[13] == bits
+    assert greatest(read_spz(tmp_path / "a.spz").means, splats.means) <= 0.5 / 2**bits + 1e-9
+
+
+def test_what_is_too_large_is_made_smaller_with_a_warning(tmp_path, caplog):
+    splats = few()
+    splats.log_scales[2, 1] = 6.1
+    write_spz(tmp_path / "a.spz", splats)
+    assert "1 Gaussians are made smaller" in caplog.text
+    assert read_spz(tmp_path / "a.spz").log_scales[2, 1] == 5.9375
+
+
+def test_what_does_not_fit_is_refused_and_nothing_written(tmp_path):
+    path = tmp_path / "a.spz"
+    with pytest.raises(FormatError, match="40000 units from the origin"):
+        write_spz(path, edge_splats(far=40000.0))
+    splats = few()
+    splats.sh_rest[0, 3, 1], splats.sh_rest[1, 0, 0] = np.inf, np.nan
+    with pytest.raises(FormatError, match=r"sh_rest \(2\)"):
+        write_spz(path, splats)
+    with pytest.raises(FormatError, match="no Gaussians"):
+        write_spz(path, splats.select(torch.arange(0)))
+    with pytest.raises(ValueError, match="version 1"):
+        write_spz(path, few(), version=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_lies_outside_the_bytes_is_clamped(tmp_path):
+    splats = few()
+    splats.log_scales[0, 0], splats.sh_dc[0, 0], splats.sh_rest[0, 0, 0] = -13, 7, -4
+    write_spz(tmp_path / "a.spz", splats)
+    back = read_spz(tmp_path / "a.spz")
+    assert back.log_scales[0, 0] == -10
+    assert back.sh_dc[0, 0] == pytest.approx(0.5 / 0.15)
+    assert back.sh_rest[0, 0, 0] == -1
+
+
+def with_extension(path, kind, payload):
+    """Adds an extension to a file that has none, where its version has them."""
+    record = struct.pack("<II", kind, len(payload)) + payload
+    data = path.read_bytes()
+    if data[:4] != b"NGSP":
+        data = plain(path)
+        data = gzip.compress(data[:14] + b"\2" + data[15:] + record)
+    else:
+        data = data[:14] + b"\2" + data[15:16] + struct.pack("<I", 32 + len(record)) + (
+            bytes(12) + record + data[32:])
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("kind", [0xADBE0002, 0x12340001])
+def test_extensions_that_change_nothing_are_passed_over(tmp_path, version, kind):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=version, axes=None)
+    wanted = read_spz(path)
+    with_extension(path, kind, b"\4\0\0\0")
+    assert torch.equal(read_spz(path).means, wanted.means)
+
+
+# Numbers of the extension and the signs that lead to "rdf", or "rfu" where up is along z; checked
+# against @adobe/spz 0.2.3, the library of Niantic and Adobe.
+@pytest.mark.parametrize(("number", "signs", "up"), [
+    (4, [1, -1, -1], "-y"), (6, [1, 1, 1], "-y"), (7, [-1, -1, 1], "-y"), (8, [1, -1, 1], "-y"),
+    (1, [-1, 1, -1], "-y"), (12, [1, 1, 1], "z"), (16, [1, -1, 1], "z"), (10, [1, 1, -1], "z"),
+])
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_the_axes_that_a_file_names_are_turned_into_ours(tmp_path, number, signs, up, version):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=version, axes=None)
+    stored = read_spz(path)
+    with_extension(path, 0xADBE0003, struct.pack("<I", number))
+    scene = load_spz(path)
+    assert scene.up == up
+    assert torch.equal(scene.splats.means, stored.means * torch.tensor(signs))
+    # The colour along d of the scene is the one along the d that the signs make of it in the file.
+    direction = torch.tensor([[0.36, 0.48, 0.8]], dtype=torch.float64)
+    ours = basis_rest(direction, 3) @ scene.splats.sh_rest[0].double()
+    theirs = basis_rest(direction * torch.tensor(signs), 3) @ stored.sh_rest[0].double()
+    assert torch.allclose(ours, theirs, atol=1e-6)
+
+
+def test_a_file_that_names_no_axes_stays_and_those_given_win(tmp_path):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), axes=None)
+    stored = read_spz(path)
+    assert load_spz(path).up is None
+    assert torch.equal(read_spz(path, axes="rub").means, stored.means * torch.tensor([1, -1, -1]))
+    with_extension(path, 0xADBE0003, struct.pack("<I", 0))  # unspecified
+    assert torch.equal(read_spz(path).means, stored.means)
+    write_spz(path, few(), axes="rub")
+    assert torch.equal(read_spz(path).means, stored.means * torch.tensor([1, -1, -1]))
+    assert torch.equal(read_spz(path, axes="rdf").means, stored.means)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_the_file_names_its_axes_and_the_antialiasing_of_its_scene(tmp_path, version):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=version)
+    assert struct.pack("<III", 0xADBE0003, 4, 6) in (
+        path.read_bytes() if version == 4 else plain(path))
+    assert (load_spz(path).up, load_spz(path).antialiased) == ("-y", False)
+    write_spz(path, few(), version=version, axes="rfu", antialiased=True)
+    assert (load_spz(path).up, load_spz(path).antialiased) == ("z", True)
+    assert torch.equal(read_spz(path).sh_dc, read_spz(path, axes="rfu").sh_dc)
+
+
+def test_harmonics_of_degree_4_are_cut_to_degree_3_with_a_warning(tmp_path, caplog):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), axes=None)
+    wanted, data = read_spz(path), plain(path)
+    n, start = len(few()), 16 + 20 * len(few())
+    harmonics = np.frombuffer(data[start:], np.uint8).reshape(n, 15, 3)
+    more = np.concatenate([harmonics, np.full((n, 9, 3), 7, np.uint8)], axis=1)
+    path.write_bytes(data[:12] + b"\4" + data[13:start] + more.tobytes())
+    assert torch.equal(read_spz(path).sh_rest, wanted.sh_rest)
+    assert "degree 4 are cut to degree 3" in caplog.text
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_many_equal_gaussians_are_read_back(tmp_path, version):
+    """They pack far better than any scene and must not be taken for a bomb."""
+    splats = few(1).map(lambda value: value.repeat(150_000, *[1] * (value.dim() - 1)))
+    write_spz(tmp_path / "a.spz", splats, version=version)
+    assert len(read_spz(tmp_path / "a.spz")) == 150_000
