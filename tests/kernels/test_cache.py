@@ -117,8 +117,9 @@ def test_the_number_of_lanes_follows_the_features_that_numba_compiles_for(
 
 def test_a_change_of_any_source_changes_the_fingerprint(monkeypatch):
     seen, read = {kernel.fingerprint()}, Path.read_bytes
-    folder = Path(kernel.__file__).parent
-    sources = [*folder.glob("*.py"), folder.parent / "contract.py"]
+    package = Path(kernel.__file__).parents[1]
+    sources = [*package.glob("kernels/*.py"), *package.glob("render/numba/*.py"),
+               package / "render" / "contract.py"]
     for changed in sources:
         monkeypatch.setattr(
             Path, "read_bytes", lambda path, changed=changed: read(path) + b"#" * (path == changed))

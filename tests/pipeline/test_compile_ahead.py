@@ -125,7 +125,7 @@ def test_with_a_driver_of_a_gpu_its_kernels_are_compiled_too(
 @pytest.mark.parametrize(("age", "beside"), [(-100, False), (100, True)])
 def test_kernels_of_an_earlier_installation_do_not_count(
         tmp_path, monkeypatch, mark, package, age, beside):
-    source = tmp_path / "sources" / package / "kernel.py"
+    source = tmp_path / "sources" / "render" / package / "kernel.py"
     source.parent.mkdir(parents=True)
     source.touch()
     monkeypatch.setattr(compile_ahead, "_SOURCES", tmp_path / "sources")

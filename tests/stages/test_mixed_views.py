@@ -10,9 +10,10 @@ from tiny_scene import TWO, make_inputs, write_masks
 
 from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.evaluation import reference_views
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image
+from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import size_summary
 from recon_cli.stages import evaluate, prune, train
 from recon_cli.train import train_data
 from recon_cli.train.train_data import estimate_memory
@@ -95,11 +96,11 @@ def test_the_largest_view_decides_the_memory_and_masks_are_counted(tmp_path, mon
     monkeypatch.setattr(train_data, "estimate_memory", recorded)
     inputs = make_inputs(tmp_path, TWO[::-1])  # the smaller one comes first
     write_masks(inputs, {"000001.png": np.ones((44, 30), bool)})
-    scene = reference_views.load_scene(inputs.folders, validation=0.1)
+    scene = load_scene(inputs.folders, validation=0.1)
     train_data.load_task(scene, CONFIG, StageContext())
     assert (asked[0]["width"], asked[0]["height"], asked[0]["masks"]) == (48, 36, 1)
 
 
 def test_views_of_one_size_are_summarised_without_a_list():
     camera = TWO[0].at(np.eye(4))
-    assert reference_views.size_summary([camera, camera]) == {"width": 48, "height": 36}
+    assert size_summary([camera, camera]) == {"width": 48, "height": 36}

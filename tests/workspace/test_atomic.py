@@ -75,4 +75,4 @@ def test_everything_that_is_read_as_json_or_toml_goes_through_one_reader() -> No
         path.relative_to(package).as_posix() for path in package.rglob("*.py")
         if any(word in path.read_text(encoding="utf-8")
                for word in ("json.loads(", "json.load(", "tomllib.load"))}
-    assert {name for name in found - others if not name.startswith("io/splats/")} == set()
+    assert {name for name in found - others if not name.startswith("splats/")} == set()
