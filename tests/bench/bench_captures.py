@@ -144,31 +144,10 @@ def noisy_fox(data: Path, out: Path) -> Path:
 
 def blurred_video(data: Path, out: Path) -> Path:
     """880 frames of office, 269 of them blurred."""
-    called("bench_frame_choice.py", data / "rooms" / "office", out)
+    subprocess.run([
+        sys.executable, str(Path(__file__).with_name("bench_frame_choice.py")),
+        str(data / "rooms" / "office"), str(out)], check=True)
     return out / "video.mp4"
-
-
-def dng(data: Path, out: Path) -> Path:
-    """Snowmiku as camera RAW, exposures a stop up and down."""
-    called("make_dng_set.py", data / "snowmiku_photos", out / "photos")
-    return out / "photos"
-
-
-def large_walk(_data: Path, out: Path) -> Path:
-    """200 views of 1280x720 of office, once that is trained."""
-    workspace = out.parent / "office" / "ws"
-    if not (workspace / "train" / "splats.ply").exists():
-        code, error = ran(workspace, "train")
-        if code:
-            raise click.ClickException(f"office, which is to be mapped before: {error}")
-    called("make_large_walk.py", workspace, out / "photos")
-    return out / "photos"
-
-
-def called(script: str, *arguments: Path) -> None:
-    """Runs a script that lies beside this one."""
-    subprocess.run(
-        [sys.executable, str(Path(__file__).with_name(script)), *map(str, arguments)], check=True)
 
 
 CAPTURES = {
@@ -187,8 +166,6 @@ CAPTURES = {
     "house entry": Capture(given("video_house_entry/video.mp4")),
     "desk": Capture(given("desk_monitors/images")),
     "snowmiku": Capture(given("snowmiku_photos")),
-    "snowmiku, DNG": Capture(dng),
-    "large walk": Capture(large_walk),
     "trident": Capture(given("walks/trident_desk/video.mp4"), trident),
     "bonsai": Capture(given("walks/bonsai/images")),
     "living room loop": Capture(given("walks/living_room_loop/video.mp4")),
