@@ -19,15 +19,14 @@ from numpy.typing import NDArray
 from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.evaluation.scores import Table
+from recon_cli.experiments.outputs import Result
 from recon_cli.experiments.runner import run_grid
 from recon_cli.io.images import read_png
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
-from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 from recon_cli.workspace.records import FOLDER, read_frame_list
 
-RESULT = "compare.json"
 _SAMPLES = 3  # frames, spread over the capture: 20 s in all at 1080x1920 on one core
 _MEASURED = 16  # frames whose noise is measured: 3 s
 _LEAST_NOISE = 0.5  # 1/255; rounding to 8 bits alone makes .3
@@ -73,7 +72,7 @@ VARIANTS = (
       for name, function in FILTERS.items() for strength in STRENGTHS))
 
 
-def compare_filters(job: Job, config: DenoiseConfig) -> str:
+def compare_filters(job: Job, config: DenoiseConfig) -> Result:
     """Writes compare.json into the workspace and returns a table and a recommendation.
 
     Raises:
@@ -93,16 +92,15 @@ def compare_filters(job: Job, config: DenoiseConfig) -> str:
         total = len(levels) * len(VARIANTS) * len(truths)
         with job.progress.bar("compare", total, unit="run") as bar:
             scores = score_filters(truths, levels, on_run=bar.advance)
-        atomic.write_json(root / RESULT, {
-            "measured_noise_255": noise,
-            "frames": samples,
+        result = Result({
+            "measured_noise_255": noise, "frames": samples,
             "reduced": "by area to half the size, before noise was added",
             "opencv_threads": cv2.getNumThreads(),
-            "scores": [asdict(score) for score in scores]})
-    heading = (
-        f"PSNR in dB and share of the edges kept, {len(samples)} frames at half their size with "
-        "white noise added (in 1/255)")
-    return "\n\n".join([heading, _table(scores), _advice(config, noise, scores)])
+            "scores": [asdict(score) for score in scores],
+        }, f"PSNR in dB and share of the edges kept, {len(samples)} frames at half their size with "
+            "white noise added (in 1/255)", [_table(scores)], [_advice(config, noise, scores)])
+        result.save(root, "compare")
+    return result
 
 
 def _pick_evenly(names: Sequence[str], count: int) -> list[str]:
@@ -201,7 +199,7 @@ def _score_of_none(scores: Sequence[FilterScore], level: float) -> FilterScore:
     return next(score for score in scores if score.filter == "none" and score.noise_255 == level)
 
 
-def _table(scores: Sequence[FilterScore]) -> str:
+def _table(scores: Sequence[FilterScore]) -> Table:
     levels = sorted({score.noise_255 for score in scores})
     rows = []
     for first in range(0, len(scores), len(levels)):  # by filter, then by level
@@ -212,7 +210,7 @@ def _table(scores: Sequence[FilterScore]) -> str:
             *(f"{score.psnr_db:.1f} {score.edges_kept:4.0%}" for score in own),
             f"{sum(score.seconds_per_megapixel for score in own) / len(own):.2f}"))
     return Table(
-        ("filter", "strength", *(f"noise {level:g}" for level in levels), "s/MP"), rows).text()
+        ("filter", "strength", *(f"noise {level:g}" for level in levels), "s/MP"), rows)
 
 
 def _advice(config: DenoiseConfig, noise: float, scores: Sequence[FilterScore]) -> str:
