@@ -28,6 +28,7 @@ from playwright.sync_api import Browser
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from browser import launch_browser, watch_page
+from workbench import workspace_argument
 
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import fit_camera, to_uint8
@@ -118,7 +119,7 @@ def photographed(chromium: Browser, workspace: Path, path: Path) -> None:
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspace_argument
 @click.option("--picture", type=click.Path(path_type=Path))
 def main(workspace: Path, picture: Path | None) -> None:
     """Prints the figures of a workspace."""
