@@ -176,7 +176,7 @@ def noise(scene: BenchScene) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class BenchPlan:
-    """What is measured."""
+    """The measurements to make."""
 
     size: SceneSize
     sh_degree: int

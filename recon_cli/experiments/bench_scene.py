@@ -25,7 +25,7 @@ from recon_cli.scene.splats import Splats
 _ROOM = np.array([6.0, 4.0, 3.0])  # metres; z is up
 _BOXES = 12  # pieces of furniture
 _AREA = 2 * (24 + 18 + 12) + _BOXES * 2.4  # square metres of walls and furniture, about
-_COVERAGE = 0.45  # standard deviation over spacing: what trained scenes have, within a factor of 2
+_COVERAGE = 0.45  # standard deviation over spacing: that of trained scenes within a factor of 2
 FLIP = 1e-5  # a larger error of a pixel means a fragment more or less, not rounding
 _THINNESS = 0.15  # of the axis across the wall: trained Gaussians lie flat on surfaces
 

@@ -1,4 +1,4 @@
-"""`recon denoise --compare`: what each noise filter would gain and lose on the frames of a capture.
+"""`recon denoise --compare`: gain and loss of each noise filter on the frames of a capture.
 
 The reference is the capture's own frames reduced to half size by area, which halves their noise;
 noise of known levels is added to it. Video compression is not simulated, so for a video the figures
@@ -218,7 +218,7 @@ def _advice(config: DenoiseConfig, noise: float, scores: Sequence[FilterScore]) 
     lines = [f"The noise of the frames is {noise:.1f}/255 (median)."]
     chosen = best(scores, noise) if noise >= _LEAST_NOISE else None
     if chosen is None:
-        lines.append("That is no more than rounding to 8 bits leaves: there is nothing to remove.")
+        lines.append("Rounding to 8 bits leaves as much: there is nothing to remove.")
     elif chosen.filter == "none":
         lines.append("Doing nothing is best at that level; recon denoise --off does that.")
     else:

@@ -148,9 +148,9 @@ def examine(threads: int, device: str) -> Host:
 
 
 def measure_memory(work: Callable[[], object], device: str) -> int:
-    """Returns the peak bytes that `work` added: on a GPU what torch allocated.
+    """Returns the peak bytes that `work` added: on a GPU those that torch allocated.
 
-    On a CPU resident memory, sampled every millisecond, with what an allocator keeps.
+    On a CPU resident memory, sampled every millisecond, with the reserve of an allocator.
     """
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()

@@ -59,7 +59,7 @@ class BenchRequest:
         self.outputs.check()
 
     def plan(self) -> BenchPlan:
-        """Returns what is measured; BackendError if a backend or device is not available."""
+        """Returns the measurements to make; BackendError if a backend is not available."""
         if self.backends:
             resolved = [registry.resolve(name, self.device) for name in self.backends]
             backends, device = tuple(dict.fromkeys(name for name, _ in resolved)), resolved[0][1]
@@ -352,7 +352,7 @@ def ratio(old: float | None, new: float | None) -> float | None:
 
 
 def machine_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Returns what differs between the machines of two records; empty where nothing does."""
+    """Returns the differences between the machines of two records; empty if there are none."""
     was, now = old["machine"], new["machine"]
     return "; ".join(f"{key} {was[key]} there, {now[key]} here"
                      for key in ("cpu", "cores", "lanes", "device") if was[key] != now[key])

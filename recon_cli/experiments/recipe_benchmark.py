@@ -46,7 +46,7 @@ class RecipeRequest(ExperimentRequest):
     recipes: tuple[Variant, ...]
     iterations: int | None = None  # of every run; None where seconds or neither are given
     seconds: float | None = None  # of every run instead
-    targets_db: tuple[float, ...] = ()  # PSNR to reach; empty for what all runs of a scene reach
+    targets_db: tuple[float, ...] = ()  # PSNR to reach; empty for that of all runs
     outputs: OutputFiles = field(default_factory=OutputFiles)
 
     def __post_init__(self) -> None:

@@ -46,7 +46,7 @@ class SeedScores:
     seeds: tuple[int, ...]
     models: Mapping[str, Figures]
     difference: Figures  # pruned minus base; empty where nothing is pruned
-    kinds: Mapping[str, str]  # what tables call each model
+    kinds: Mapping[str, str]  # the name of each model in tables
 
     def result(self) -> Result:
         """Returns mean and deviation of every figure, and the content of seeds.json."""

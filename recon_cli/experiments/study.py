@@ -44,9 +44,9 @@ from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.layout import disk_errors, hold_lock
 
-# The paper compares the first two; the others are what `recon train` does without and with --prune.
+# The paper compares the first two; the others are `recon train` without and with --prune.
 VARIANTS: tuple[Variant, ...] = (REFERENCE, PAPER, BUDGET, BUDGET_PRUNED)
-BASELINE, DEFAULT = REFERENCE, BUDGET  # what the others are compared with
+BASELINE, DEFAULT = REFERENCE, BUDGET  # the others are compared with these
 PAIRS: tuple[tuple[Variant, Variant], ...] = (
     *((variant, BASELINE) for variant in VARIANTS if variant is not BASELINE),
     *((variant, DEFAULT) for variant in VARIANTS if variant not in (BASELINE, DEFAULT)))
@@ -289,7 +289,7 @@ def tables(result: StudyResult) -> list[Table]:
 
 
 def head(result: StudyResult) -> str:
-    """Returns what was run and where."""
+    """Returns a line on the runs and their machines."""
     scenes = "; ".join(
         f"{name}: {scene.views} test views at {scene.width}x{scene.height}"
         for name, scene in result.scenes.items())

@@ -152,7 +152,7 @@ def _score_validation(state: TrainState, task: Task) -> MeanScore:
 
 
 def table(trials: Sequence[SweepTrial], score: str) -> Table:
-    """Returns the trials as a table; a control is named by what it has in common with them."""
+    """Returns the trials as a table; a control is named by the quantity that equals theirs."""
     def cells(scores: MeanScore | None) -> tuple[str, str]:
         return ("-", "-") if scores is None else (f"{scores.psnr_db:.2f}", f"{scores.ssim:.4f}")
 
