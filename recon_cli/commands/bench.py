@@ -30,7 +30,7 @@ class SceneOptions:
     max_gaussians: int
 
     def fields(self, call: Call, *, validation: float | None = None) -> dict[str, Any]:
-        """Returns the fields of an ExperimentRequest; `validation` as of `runner.base_config`."""
+        """Returns the fields of an ExperimentRequest; `validation` as in `runner.base_config`."""
         from recon_cli.experiments.runner import base_config
 
         return {
@@ -136,7 +136,7 @@ def bench(ctx: click.Context, call: Call, /, outputs: OutputFiles, **typed: Any)
 
     click.echo(run(
         BenchRequest(**typed, outputs=outputs, device=compute.device, threads=compute.threads),
-        TqdmProgress()))
+        TqdmProgress()).text())
 
 
 def _refuse_own_options(ctx: click.Context) -> None:
@@ -179,7 +179,8 @@ def train(call: Call, /, scenes: SceneOptions, recipes: tuple[str, ...], **typed
     from recon_cli.experiments.variants import parse_recipes
 
     variants = parse_recipes(recipes or ("reference,budget",))
-    click.echo(run(RecipeRequest(**scenes.fields(call), **typed, recipes=variants), TqdmProgress()))
+    request = RecipeRequest(**scenes.fields(call), **typed, recipes=variants)
+    click.echo(run(request, TqdmProgress()).text())
 
 
 bench.add_command(train)
@@ -211,4 +212,5 @@ def study(call: Call, /, scenes: SceneOptions, **typed: Any) -> None:
     from recon_cli.experiments.study import StudyRequest, run
 
     # nothing looks at validation views here, so all but the test views are trained on
-    click.echo(run(StudyRequest(**scenes.fields(call, validation=0.0), **typed), TqdmProgress()))
+    request = StudyRequest(**scenes.fields(call, validation=0.0), **typed)
+    click.echo(run(request, TqdmProgress()).text())

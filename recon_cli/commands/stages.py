@@ -61,7 +61,7 @@ def denoise(call: Call, compare: bool) -> None:
     if compare:
         from recon_cli.experiments.filter_comparison import compare_filters
 
-        click.echo(compare_filters(*open_job_with(call, DenoiseConfig)))
+        click.echo(compare_filters(*open_job_with(call, DenoiseConfig)).text())
         return
     run_stages(call, "denoise", ["denoise"])
 
@@ -140,7 +140,7 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
     if sweep:
         from recon_cli.experiments.sweep import run_sweep
 
-        click.echo(run_sweep(*open_job_with(call, PruneConfig), ratios))
+        click.echo(run_sweep(*open_job_with(call, PruneConfig), ratios).text())
         return
     run_stages(call, "prune", ["prune"])
 

@@ -1,4 +1,4 @@
-"""The measurement of `recon bench`: every backend, thread count, loss and approximation."""
+"""The measurement of `recon bench`: every backend, thread count and approximation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments import instruments
@@ -29,14 +28,13 @@ from recon_cli.experiments.bench_scene import (
     renderer_of,
     variants_for,
 )
-from recon_cli.experiments.instruments import Host, Samples, Stopwatch, Timing, timing_of
+from recon_cli.experiments.instruments import Host, Samples, Stopwatch, Timing
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.progress import Bar, Progress
 from recon_cli.render import registry
 from recon_cli.render.contract import Renderer, RenderOutput, StepOptions
-from recon_cli.render.numba.loss import C1, C2, MAPS, RADIUS, photometric, taps
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step, photometric_loss
+from recon_cli.train.gradient import gradient_step
 from recon_cli.train.optimizer import SplatOptimizer
 
 SCHEMA = "recon-bench"
@@ -113,7 +111,7 @@ class VariantResult:
     """One approximation on one backend."""
 
     name: str
-    time: Timing | None  # forward and backward; None where a difference would mean nothing
+    time: Timing  # forward and backward
     accuracy: Accuracy  # against the oracle, which follows the contract
 
 
@@ -126,7 +124,6 @@ class BenchedScene:
     height: int
     sh_degree: int
     backends: dict[str, BackendResult]  # by name, the fastest kind first
-    losses: dict[str, Timing]  # forward and backward of each photometric loss
     variants_of: str  # the backend that rendered the approximations
     variants: list[VariantResult]  # the contract first, then the approximations
 
@@ -138,19 +135,17 @@ class BenchResult:
     host: Host
     rounds: int  # behind each median
     scenes: dict[str, BenchedScene]
-    warm_start: Timing | None = None  # of the numba backend in a fresh process
 
     def record(self) -> dict[str, Any]:
         """Returns the content of the JSON file."""
         return {
             "schema": SCHEMA, "version": VERSION, "machine": asdict(self.host),
             "rounds": self.rounds,
-            "warm_start": asdict(self.warm_start) if self.warm_start else None,
             "scenes": {name: {
                 **asdict(scene),
                 "backends": {name: backend.record() for name, backend in scene.backends.items()},
                 "variants": [
-                    {"name": variant.name, "time": asdict(variant.time) if variant.time else None,
+                    {"name": variant.name, "time": asdict(variant.time),
                      **_finite(variant.accuracy)} for variant in scene.variants],
             } for name, scene in self.scenes.items()}}
 
@@ -173,43 +168,6 @@ def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
     return step
 
 
-def loss_passes(scene: BenchScene, device: str) -> dict[str, Callable[[], object]]:
-    """Returns functions that compute the photometric loss and its gradient, by name."""
-    weight, truth = RunConfig().ssim_weight, noise(scene)
-    target = torch.from_numpy(truth).to(device).float() / 255
-    image = target.flip(0).contiguous()
-    leaf = image.clone().requires_grad_()
-    passes: dict[str, Callable[[], object]] = {
-        "torch": lambda: torch.autograd.grad(photometric_loss(leaf, target, weight), leaf),
-        "autograd": lambda: torch.autograd.grad(convolution_loss(leaf, target, weight), leaf)}
-    if device == "cpu":
-        rgb, gradient = image.numpy().reshape(-1), np.empty(image.numel(), np.float32)
-        maps = np.empty(MAPS * image.numel(), np.float32)
-        passes["fused"] = lambda: photometric(
-            rgb, truth.reshape(-1), scene.camera.width, scene.camera.height, weight, maps=maps,
-            gradient=gradient)
-    return passes
-
-
-def convolution_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor:
-    """Returns `photometric_loss` as most trainers compute it: five convolutions and autograd."""
-    line = image.new_tensor(taps())
-    window = (line[:, None] * line).expand(3, 1, -1, -1)
-
-    def blur(planes: Tensor) -> Tensor:
-        return torch.nn.functional.conv2d(planes, window, padding=RADIUS, groups=3)
-
-    x, y = (item.permute(2, 0, 1)[None] for item in (image, truth))
-    mu_x, mu_y = blur(x), blur(y)
-    variances = blur(x * x) - mu_x * mu_x + blur(y * y) - mu_y * mu_y
-    covariance = blur(x * y) - mu_x * mu_y
-    ssim: Tensor = ((2 * mu_x * mu_y + float(C1)) * (2 * covariance + float(C2))) / (
-        (mu_x * mu_x + mu_y * mu_y + float(C1)) * (variances + float(C2)))
-    loss: Tensor = (
-        (1 - ssim_weight) * (image - truth).abs().mean() + ssim_weight * (1 - ssim.mean()))
-    return loss
-
-
 def noise(scene: BenchScene) -> NDArray[np.uint8]:
     """Returns a random image of the scene's size, [H, W, 3]."""
     size = (scene.camera.height, scene.camera.width, 3)
@@ -218,7 +176,7 @@ def noise(scene: BenchScene) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class BenchPlan:
-    """What is measured."""
+    """The measurements to make."""
 
     size: SceneSize
     sh_degree: int
@@ -232,15 +190,14 @@ def measure(plan: BenchPlan, host: Host, progress: Progress) -> BenchedScene:
     """Returns all results of one scene."""
     size = plan.size
     with use_threads(plan.threads), progress.bar(
-        "bench", 3 * (plan.rounds + 1) + 1, unit="round"
+        "bench", 2 * (plan.rounds + 1) + 1, unit="round"
     ) as bar:
         measurement = _Measurement(plan, bar)
         backends = measurement.measure_backends(host)
-        losses = measurement.measure_losses()
         variants = measurement.measure_variants()
     return BenchedScene(
-        size.gaussians, size.width, size.height, plan.sh_degree, backends, losses,
-        plan.backends[0], variants)
+        size.gaussians, size.width, size.height, plan.sh_degree, backends, plan.backends[0],
+        variants)
 
 
 @contextmanager
@@ -284,17 +241,6 @@ class _Measurement:
                 self._accuracy(registry.renderer(name)), self._pairs[name], self._memory[name])
             for name in plan.backends}
 
-    def measure_losses(self) -> dict[str, Timing]:
-        """Returns the time of every photometric loss, its images in the caches as in training."""
-        def time_second(work: Callable[[], object]) -> Mapping[str, float]:
-            work()
-            return self._time(work)
-
-        passes = loss_passes(self._scene, self._plan.device)
-        samples = self._alternate({
-            name: partial(time_second, work) for name, work in passes.items()})
-        return {name: timing_of(by_part["whole"]) for name, by_part in samples.items()}
-
     def measure_variants(self) -> list[VariantResult]:
         """Returns time and accuracy of the contract and of every approximation, in turn."""
         backend = self._plan.backends[0]
@@ -307,7 +253,7 @@ class _Measurement:
         return [
             VariantResult(
                 variant.name,
-                timing_of(samples[variant.name]["whole"]) if variant.saves_time else None,
+                Timing.from_samples(samples[variant.name]["whole"]),
                 self._accuracy(renderers[variant.name]))
             for variant in variants]
 
@@ -341,7 +287,7 @@ class _Measurement:
 
     def _time_passes(self, backend: str) -> dict[str, float]:
         """Returns the milliseconds of both passes and of their parts."""
-        probe = instruments.Probe(backend, self._plan.device)
+        probe = instruments.Probe(backend)
         with probe.watch():
             watch = Stopwatch(self._plan.device)
             output = _render(self._scene, registry.renderer(backend))
@@ -356,7 +302,7 @@ class _Measurement:
 
     def _time_step(self, step: Callable[[Mark], None], backend: str) -> dict[str, float]:
         """Returns the milliseconds of an optimization step and of its parts."""
-        probe = instruments.Probe(backend, self._plan.device)
+        probe = instruments.Probe(backend)
         with probe.watch():
             watch = Stopwatch(self._plan.device)
             step(watch.mark)
@@ -386,7 +332,7 @@ def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float
 
 def _compute_speed(samples: Samples, pairs: Pairs, peak: float | None, threads: int) -> Speed:
     """Returns medians and rates; those of pairs are of the compositing stages alone."""
-    times = {name: timing_of(values) for name, values in samples.items()}
+    times = {name: Timing.from_samples(values) for name, values in samples.items()}
     inner = (times.get(f"forward: {instruments.COMPOSITE}"),
              times.get(f"backward: {instruments.DECOMPOSE}"))
     forward, backward = (

@@ -25,7 +25,7 @@ from recon_cli.scene.splats import Splats
 _ROOM = np.array([6.0, 4.0, 3.0])  # metres; z is up
 _BOXES = 12  # pieces of furniture
 _AREA = 2 * (24 + 18 + 12) + _BOXES * 2.4  # square metres of walls and furniture, about
-_COVERAGE = 0.45  # standard deviation over spacing: what trained scenes have, within a factor of 2
+_COVERAGE = 0.45  # standard deviation over spacing: that of trained scenes within a factor of 2
 FLIP = 1e-5  # a larger error of a pixel means a fragment more or less, not rounding
 _THINNESS = 0.15  # of the axis across the wall: trained Gaussians lie flat on surfaces
 
@@ -104,13 +104,6 @@ class RendererVariant:
     name: str  # in the tables
     approximation: Approximation = field(default=EXACT)  # of the rasterizer
     sh_degree: int | None = None  # lower than that of the scene; None for the same
-    # SH coefficients are rounded to float16. The kernels compute in float32, so no time is saved.
-    half_colors: bool = False
-
-    @property
-    def saves_time(self) -> bool:
-        """Whether a difference in time means anything."""
-        return not self.half_colors
 
 
 CONTRACT = RendererVariant("contract")
@@ -121,8 +114,7 @@ _ALL = (
     RendererVariant("no early stop", Approximation(transmittance_min=0.0)),
     *(RendererVariant(f"alpha >= {name}", Approximation(alpha_min=factor * ALPHA_MIN))
       for name, factor in (("4/255", 4.0), ("2/255", 2.0), ("1/510", 0.5), ("1/2550", 0.1))),
-    *(RendererVariant(f"SH degree {degree}", sh_degree=degree) for degree in (0, 1, 2)),
-    RendererVariant("float16 colours", half_colors=True))
+    *(RendererVariant(f"SH degree {degree}", sh_degree=degree) for degree in (0, 1, 2)))
 
 
 def variants_for(backend: str, sh_degree: int) -> list[RendererVariant]:
@@ -142,10 +134,6 @@ def renderer_of(variant: RendererVariant, backend: str) -> Renderer:
         splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
         mask: Tensor | None = None,
     ) -> RenderOutput:
-        if variant.half_colors:  # gradients pass as through the identity
-            sh_dc, sh_rest = (sh + (sh.detach().half().to(sh.dtype) - sh.detach())
-                              for sh in (splats.sh_dc, splats.sh_rest))
-            splats = replace(splats, sh_dc=sh_dc, sh_rest=sh_rest)
         degree = sh_degree if variant.sh_degree is None else variant.sh_degree
         return draw(splats, camera, background, degree, scores, mask)
 

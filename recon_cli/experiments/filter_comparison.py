@@ -1,4 +1,4 @@
-"""`recon denoise --compare`: what each noise filter would gain and lose on the frames of a capture.
+"""`recon denoise --compare`: gain and loss of each noise filter on the frames of a capture.
 
 The reference is the capture's own frames reduced to half size by area, which halves their noise;
 noise of known levels is added to it. Video compression is not simulated, so for a video the figures
@@ -19,15 +19,14 @@ from numpy.typing import NDArray
 from recon_cli.capture.noise import FILTERS, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.evaluation.scores import Table
+from recon_cli.experiments.outputs import Result
 from recon_cli.experiments.runner import run_grid
 from recon_cli.io.images import read_png
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.execute import Job
-from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 from recon_cli.workspace.records import FOLDER, read_frame_list
 
-RESULT = "compare.json"
 _SAMPLES = 3  # frames, spread over the capture: 20 s in all at 1080x1920 on one core
 _MEASURED = 16  # frames whose noise is measured: 3 s
 _LEAST_NOISE = 0.5  # 1/255; rounding to 8 bits alone makes .3
@@ -73,7 +72,7 @@ VARIANTS = (
       for name, function in FILTERS.items() for strength in STRENGTHS))
 
 
-def compare_filters(job: Job, config: DenoiseConfig) -> str:
+def compare_filters(job: Job, config: DenoiseConfig) -> Result:
     """Writes compare.json into the workspace and returns a table and a recommendation.
 
     Raises:
@@ -93,16 +92,15 @@ def compare_filters(job: Job, config: DenoiseConfig) -> str:
         total = len(levels) * len(VARIANTS) * len(truths)
         with job.progress.bar("compare", total, unit="run") as bar:
             scores = score_filters(truths, levels, on_run=bar.advance)
-        atomic.write_json(root / RESULT, {
-            "measured_noise_255": noise,
-            "frames": samples,
+        result = Result({
+            "measured_noise_255": noise, "frames": samples,
             "reduced": "by area to half the size, before noise was added",
             "opencv_threads": cv2.getNumThreads(),
-            "scores": [asdict(score) for score in scores]})
-    heading = (
-        f"PSNR in dB and share of the edges kept, {len(samples)} frames at half their size with "
-        "white noise added (in 1/255)")
-    return "\n\n".join([heading, _table(scores), _advice(config, noise, scores)])
+            "scores": [asdict(score) for score in scores],
+        }, f"PSNR in dB and share of the edges kept, {len(samples)} frames at half their size with "
+            "white noise added (in 1/255)", [_table(scores)], [_advice(config, noise, scores)])
+        result.save(root, "compare")
+    return result
 
 
 def _pick_evenly(names: Sequence[str], count: int) -> list[str]:
@@ -201,7 +199,7 @@ def _score_of_none(scores: Sequence[FilterScore], level: float) -> FilterScore:
     return next(score for score in scores if score.filter == "none" and score.noise_255 == level)
 
 
-def _table(scores: Sequence[FilterScore]) -> str:
+def _table(scores: Sequence[FilterScore]) -> Table:
     levels = sorted({score.noise_255 for score in scores})
     rows = []
     for first in range(0, len(scores), len(levels)):  # by filter, then by level
@@ -212,7 +210,7 @@ def _table(scores: Sequence[FilterScore]) -> str:
             *(f"{score.psnr_db:.1f} {score.edges_kept:4.0%}" for score in own),
             f"{sum(score.seconds_per_megapixel for score in own) / len(own):.2f}"))
     return Table(
-        ("filter", "strength", *(f"noise {level:g}" for level in levels), "s/MP"), rows).text()
+        ("filter", "strength", *(f"noise {level:g}" for level in levels), "s/MP"), rows)
 
 
 def _advice(config: DenoiseConfig, noise: float, scores: Sequence[FilterScore]) -> str:
@@ -220,7 +218,7 @@ def _advice(config: DenoiseConfig, noise: float, scores: Sequence[FilterScore]) 
     lines = [f"The noise of the frames is {noise:.1f}/255 (median)."]
     chosen = best(scores, noise) if noise >= _LEAST_NOISE else None
     if chosen is None:
-        lines.append("That is no more than rounding to 8 bits leaves: there is nothing to remove.")
+        lines.append("Rounding to 8 bits leaves as much: there is nothing to remove.")
     elif chosen.filter == "none":
         lines.append("Doing nothing is best at that level; recon denoise --off does that.")
     else:

@@ -1,7 +1,7 @@
-"""Measuring on this machine: timings in alternated rounds, memory, arithmetic peak, and probes.
+"""Measuring on this machine: clocks, timings in alternated rounds, memory, arithmetic peak.
 
-A probe takes the time of each stage of a backend and counts the evaluated pairs of Gaussian and
-pixel while it renders; it changes nothing that is computed.
+A probe takes the time of each stage of the numba backend and counts the evaluated pairs of Gaussian
+and pixel while it renders; it does not change the result.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import statistics
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +19,12 @@ import psutil
 import torch
 
 from recon_cli import machine
+from recon_cli.evaluation.scores import number
 from recon_cli.kernels.kernel import kernel
 from recon_cli.kernels.simd import LANES
 from recon_cli.kernels.simd_functions import fill, fma, store
 from recon_cli.kernels.thread_pool import pool
-from recon_cli.processes import run_code
-from recon_cli.render import registry
 from recon_cli.render.contract import RenderOutput
-from recon_cli.render.torch import blocks, tiles
 
 # OpenMP's threads of the previous candidate keep spinning for some milliseconds after their work.
 _SETTLE_SECONDS = 0.03
@@ -42,35 +40,61 @@ class Timing:
     ms: float  # median over the rounds
     iqr_ms: float  # from the first to the third quartile; 0 for a single round
 
+    @staticmethod
+    def from_samples(samples: Sequence[float]) -> Timing:
+        """Returns the median and the interquartile range of some milliseconds."""
+        if not samples:
+            raise ValueError("no samples")
+        if len(samples) == 1:
+            return Timing(samples[0], 0.0)
+        first, middle, third = statistics.quantiles(samples, n=4, method="inclusive")
+        return Timing(middle, third - first)
 
-def timing_of(samples: Sequence[float]) -> Timing:
-    """Returns the median and the interquartile range of some milliseconds."""
-    if not samples:
-        raise ValueError("no samples")
-    if len(samples) == 1:
-        return Timing(samples[0], 0.0)
-    first, middle, third = statistics.quantiles(samples, n=4, method="inclusive")
-    return Timing(middle, third - first)
+    def text(self, digits: int = 3) -> str:
+        """Returns the median with the interquartile range in brackets."""
+        return f"{number(self.ms, digits)} ({number(self.iqr_ms, 2)})"
 
 
-class Stopwatch:
-    """Measures the time between marks; waits for the device at each of them."""
+class Clock:
+    """Measures wall and CPU seconds since its creation, without its pauses; waits for a GPU."""
 
     def __init__(self, device: str) -> None:
         self._device = device
+        self._start = self._now()
+
+    def seconds(self) -> tuple[float, float]:
+        """Returns the wall seconds, and the CPU seconds of all threads of this process."""
+        (wall, cpu), (wall_start, cpu_start) = self._now(), self._start
+        return wall - wall_start, cpu - cpu_start
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Excludes the time of the block."""
+        before = self.seconds()
+        try:
+            yield
+        finally:
+            wall, cpu = self._now()
+            self._start = wall - before[0], cpu - before[1]
+
+    def _now(self) -> tuple[float, float]:
+        if self._device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter(), time.process_time()
+
+
+class Stopwatch(Clock):
+    """Measures the time between marks."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(device)
         self.ms: dict[str, float] = {}
-        self._last = self._now()
 
     def mark(self, name: str) -> None:
         """Adds the time since the last mark to that of `name`."""
         now = self._now()
-        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now - self._last)
-        self._last = now
-
-    def _now(self) -> float:
-        if self._device == "cuda":
-            torch.cuda.synchronize()
-        return time.perf_counter()
+        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now[0] - self._start[0])
+        self._start = now
 
 
 def alternate(
@@ -82,11 +106,11 @@ def alternate(
     Returns the samples of each. A first round that compiles and warms caches is not counted.
     """
     samples: dict[str, Samples] = {name: {} for name in works}
-    for number in range(rounds + 1):
+    for round_number in range(rounds + 1):
         for name, work in works.items():
             time.sleep(_SETTLE_SECONDS)
             parts = work()
-            if number:
+            if round_number:
                 for part, ms in parts.items():
                     samples[name].setdefault(part, []).append(ms)
         on_round()
@@ -124,9 +148,9 @@ def examine(threads: int, device: str) -> Host:
 
 
 def measure_memory(work: Callable[[], object], device: str) -> int:
-    """Returns the peak bytes that `work` added: on a GPU what torch allocated.
+    """Returns the peak bytes that `work` added: on a GPU those that torch allocated.
 
-    On a CPU resident memory, sampled every millisecond, with what an allocator keeps.
+    On a CPU resident memory, sampled every millisecond, with the reserve of an allocator.
     """
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
@@ -151,21 +175,6 @@ def measure_memory(work: Callable[[], object], device: str) -> int:
         thread.join()
     added: int = max(peak, process.memory_info().rss) - start
     return added
-
-
-_WARM_START = """
-import torch, time  # torch is needed anyway; its import is not counted
-start = time.perf_counter()
-from recon_cli.render import registry
-registry.prepare("numba", lambda: None)
-print(time.perf_counter() - start)
-"""
-
-
-def warm_start(rounds: int) -> Timing:
-    """Returns the time from importing the backend to kernels that are ready, in new processes."""
-    registry.prepare("numba", lambda: None)  # fills the cache
-    return timing_of([1e3 * float(run_code(_WARM_START).split()[-1]) for _ in range(rounds)])
 
 
 # Operations of an evaluated pair, forward and backward, counted in the inner loops of the
@@ -231,32 +240,22 @@ _STAGES = {"composite_backward": DECOMPOSE, "project_backward": "unproject"}
 
 
 class Probe:
-    """Measures a backend while `watch`; of backends other than numba and torch, nothing."""
+    """Times the stages of the numba backend while `watch`; of other backends, nothing."""
 
-    def __init__(self, backend: str, device: str) -> None:
-        self._backend, self._device = backend, device
+    def __init__(self, backend: str) -> None:
+        self._numba = backend == "numba"
         self._ms: dict[str, float] = {}  # by stage, since the last `collect`
-        self._pairs = [0, 0]  # forward, backward; of torch
-        self._in_backward = False
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        """Measures within the block: numba's parallel kernels, or the functions of torch."""
-        with ExitStack() as stack:
-            if self._backend == "numba":
-                pool.observer = lambda name, seconds: self._add(
-                    _STAGES.get(name, name), 1e3 * seconds)
-                stack.callback(setattr, pool, "observer", None)
-            elif self._backend == "torch":
-                for place, name, label in (
-                    (tiles, "project", "project"), (tiles, "bin_to_tiles", "bin_to_tiles"),
-                    (tiles._Rasterize, "forward", COMPOSITE),
-                    (tiles._Rasterize, "backward", DECOMPOSE),
-                ):
-                    stack.enter_context(_replace(
-                        place, name, self._time_calls(label, getattr(place, name))))
-                stack.enter_context(_replace(tiles, "alphas", self._count_pairs))
+        """Times the parallel kernels within the block."""
+        if self._numba:
+            pool.observer = self._add
+        try:
             yield
+        finally:
+            if self._numba:
+                pool.observer = None
 
     def collect(self) -> dict[str, float]:
         """Returns the milliseconds since the last call and starts anew."""
@@ -265,38 +264,11 @@ class Probe:
 
     def pairs(self, output: RenderOutput) -> tuple[int, int] | None:
         """Returns pairs (forward, backward) of an output that has been through both passes."""
-        if self._backend == "numba":  # all pixels of a row of a tile; torch: all of a tile
-            view_pass = output.rgb.grad_fn.lease.view_pass  # type: ignore[union-attr]
-            return view_pass.pairs_forward, view_pass.pairs_backward
-        return (self._pairs[0], self._pairs[1]) if self._backend == "torch" else None
+        if not self._numba:
+            return None
+        view_pass = output.rgb.grad_fn.lease.view_pass  # type: ignore[union-attr]
+        return view_pass.pairs_forward, view_pass.pairs_backward
 
-    def _add(self, name: str, ms: float) -> None:
-        self._ms[name] = self._ms.get(name, 0.0) + ms
-
-    def _time_calls(self, label: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        def run(*args: Any) -> Any:
-            if label in (COMPOSITE, DECOMPOSE):
-                self._in_backward = label == DECOMPOSE
-                self._pairs[self._in_backward] = 0
-            watch = Stopwatch(self._device)
-            result = work(*args)
-            watch.mark(label)
-            self._add(label, watch.ms[label])
-            return result
-
-        return run
-
-    def _count_pairs(self, table: Any, block: Any, *rest: Any) -> Any:
-        self._pairs[self._in_backward] += block.rows.numel() * blocks.PIXELS
-        return blocks.alphas(table, block, *rest)
-
-
-@contextmanager
-def _replace(place: Any, name: str, function: Callable[..., Any]) -> Iterator[None]:
-    """Replaces a function of a module, or a static method of a class, within the block."""
-    original = vars(place)[name]
-    setattr(place, name, staticmethod(function) if isinstance(place, type) else function)
-    try:
-        yield
-    finally:
-        setattr(place, name, original)
+    def _add(self, kernel_name: str, seconds: float) -> None:
+        stage = _STAGES.get(kernel_name, kernel_name)
+        self._ms[stage] = self._ms.get(stage, 0.0) + 1e3 * seconds

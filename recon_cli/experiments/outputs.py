@@ -1,8 +1,13 @@
-"""Files that an experiment writes: JSON, a picture, tables between two marks of a page."""
+"""The shape that every experiment ends in: a record, tables and a picture, and their files.
+
+An experiment is one function of a request: it measures a grid of variants and repeats
+(`runner.run_grid`) and returns a `Result`. Writing, drawing and printing it are here alone.
+"""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +25,44 @@ BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"
 _INSTALL = "pip install 'recon-cli[plot]'"
 
 logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True)
+class Result:
+    """The result of an experiment."""
+
+    record: Mapping[str, Any]  # the content of its JSON file
+    head: str  # what was measured, where and how
+    tables: Sequence[Table]
+    notes: Sequence[str] = ()  # how the tables are to be read
+    draw: Callable[[Path], None] | None = None  # draws the picture into a .png or .svg
+
+    def text(self) -> str:
+        """Returns the text for the terminal."""
+        return "\n\n".join([self.head, *(table.text() for table in self.tables), *self.notes])
+
+    def markdown(self) -> str:
+        """Returns the same in Markdown."""
+        tables = (table.markdown().rstrip() for table in self.tables)
+        return "\n\n".join([self.head + ".", *tables, *self.notes])
+
+    def format(self, form: str) -> str:
+        """Returns it as text, markdown, latex or json."""
+        if form == "json":
+            return json.dumps(self.record, indent=1)
+        if form == "latex":
+            return "\n".join(table.latex() for table in self.tables).rstrip()
+        return self.markdown() if form == "markdown" else self.text()
+
+    def save(self, folder: Path, name: str) -> None:
+        """Writes NAME.json, and NAME.svg unless matplotlib is missing."""
+        atomic.write_json(folder / f"{name}.json", self.record)
+        if self.draw is None:
+            return
+        if _can_draw():
+            self.draw(folder / f"{name}.svg")
+        else:
+            logger.warning("%s.svg is not drawn: matplotlib is not installed; %s", name, _INSTALL)
 
 
 @dataclass(frozen=True)
@@ -45,31 +88,19 @@ class OutputFiles:
         if self.markdown is not None:
             _with_text(self.markdown, "")
 
-    def write(
-        self, record: Mapping[str, Any], head: str, tables: Sequence[Table],
-        draw: Callable[[Path], None],
-    ) -> str:
-        """Writes them, and returns the head and the tables for the terminal."""
+    def write(self, result: Result) -> None:
+        """Writes those that are wanted."""
         if self.json_file is not None:
-            atomic.write_json(self.json_file, record)
-        if self.plot is not None:
-            draw(self.plot)
+            atomic.write_json(self.json_file, result.record)
+        if self.plot is not None and result.draw is not None:
+            result.draw(self.plot)
         if self.markdown is not None:
-            text = "\n\n".join([head + ".", *(table.markdown() for table in tables)])
-            atomic.write_bytes(self.markdown, _with_text(self.markdown, text).encode())
-        return "\n\n".join([head, *(table.text() for table in tables)])
+            page = _with_text(self.markdown, result.markdown())
+            atomic.write_bytes(self.markdown, page.encode())
 
 
 def _can_draw() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
-
-
-def draw_if_possible(draw: Callable[[Path], None], path: Path) -> None:
-    """Draws a picture, or warns that matplotlib is missing."""
-    if _can_draw():
-        draw(path)
-    else:
-        logger.warning("%s is not drawn: matplotlib is not installed; %s", path.name, _INSTALL)
 
 
 @contextmanager

@@ -24,14 +24,14 @@ from recon_cli.experiments.bench_measure import (
     measure,
 )
 from recon_cli.experiments.bench_scene import QUICK, SIZES, Accuracy
-from recon_cli.experiments.instruments import Timing, examine, warm_start
-from recon_cli.experiments.outputs import OutputFiles, drawing
+from recon_cli.experiments.instruments import examine
+from recon_cli.experiments.outputs import OutputFiles, Result, drawing
 from recon_cli.progress import Progress
 from recon_cli.render import registry
 from recon_cli.workspace import atomic
 
 _ROUNDS, _QUICK_ROUNDS = 7, 2
-_REFERENCE = "torch"  # what the other backends and losses are compared with
+_REFERENCE = "torch"  # the other backends are compared with it
 _FLOOR = 1e-9  # for an error of zero on a logarithmic axis
 
 logger = logging.getLogger("recon")
@@ -59,7 +59,7 @@ class BenchRequest:
         self.outputs.check()
 
     def plan(self) -> BenchPlan:
-        """Returns what is measured; BackendError if a backend or device is not available."""
+        """Returns the measurements to make; BackendError if a backend is not available."""
         if self.backends:
             resolved = [registry.resolve(name, self.device) for name in self.backends]
             backends, device = tuple(dict.fromkeys(name for name, _ in resolved)), resolved[0][1]
@@ -98,36 +98,35 @@ def parse_size(size: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def run(request: BenchRequest, progress: Progress) -> str:
-    """Measures, writes the files, and returns the text for the terminal."""
+def run(request: BenchRequest, progress: Progress) -> Result:
+    """Measures, writes the files, and returns the result."""
     plan = request.plan()
     old = request.earlier_record(plan)
     host = examine(plan.threads, plan.device)
-    warm = warm_start(plan.rounds) if "numba" in plan.backends else None
-    result = BenchResult(host, plan.rounds, {request.scene: measure(plan, host, progress)}, warm)
-    record = result.record()
-    text = request.outputs.write(
-        record, head(result), tables(result), lambda path: draw(result, path))
+    benched = BenchResult(host, plan.rounds, {request.scene: measure(plan, host, progress)})
+    result = Result(benched.record(), head(benched), tables(benched),
+                    draw=lambda path: draw(benched, path))
+    request.outputs.write(result)
     if old is None:
-        return text
-    if difference := machine_difference(old, record):
+        return result
+    if difference := machine_difference(old, result.record):
         logger.warning("the other file is of another machine: %s", difference)
-    return f"{text}\n\n{comparison_table(old, record).text()}"
+    return replace(result, tables=[*result.tables, comparison_table(old, result.record)])
 
 
 def tables(result: BenchResult) -> list[Table]:
     """Returns all tables of a result, in the order in which they are read."""
     return [table for name, scene in result.scenes.items() for table in _scene_tables(
         f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
-        f"SH degree {scene.sh_degree}", scene, result.warm_start)]
+        f"SH degree {scene.sh_degree}", scene)]
 
 
-def _scene_tables(where: str, scene: BenchedScene, warm_start: Timing | None) -> tuple[Table, ...]:
+def _scene_tables(where: str, scene: BenchedScene) -> tuple[Table, ...]:
     errors = Table(
         ("backend", "ms", *_ERRORS),
         [(name, number(backend.speed.both_ms), *_accuracy_cells(backend.accuracy))
          for name, backend in scene.backends.items()], f"Error against float64 ({where})")
-    return (_figures(where, scene, warm_start), _stages(where, scene), errors,
+    return (_figures(where, scene), _stages(where, scene), errors,
             _variants(where, scene))
 
 
@@ -137,27 +136,14 @@ def head(result: BenchResult) -> str:
             "interquartile range in brackets")
 
 
-def _ms(timing: Timing | None) -> str:
-    """Returns median and interquartile range in milliseconds."""
-    return "-" if timing is None else f"{number(timing.ms)} ({number(timing.iqr_ms, 2)})"
-
-
 def _ratio(old: float | None, new: float | None) -> str:
     return "-" if (value := ratio(old, new)) is None else f"{value:.2f}x"
 
 
-def _figures(where: str, scene: BenchedScene, warm_start: Timing | None) -> Table:
+def _figures(where: str, scene: BenchedScene) -> Table:
     """Returns the main figures, one row each, a column a backend."""
     backends = list(scene.backends.values())
     rows = [(name, *map(cell, backends)) for name, cell in _figure_rows(scene)]
-    blank = [""] * (len(backends) - 1)
-    if warm_start is not None:
-        rows.append(("kernels ready in a fresh process, ms", _ms(warm_start), *blank))
-    fused = scene.losses.get("fused")
-    for name, timing in scene.losses.items():
-        rows.append((f"loss {name}, ms", _ms(timing), *blank))
-        if fused and timing is not fused:
-            rows.append((f"loss {name} : fused", _ratio(timing.ms, fused.ms), *blank))
     return Table(("what", *scene.backends), rows, f"Figures ({where})")
 
 
@@ -179,7 +165,7 @@ def _figure_rows(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult
             _core(backend).times["step"].ms, backend.speed.times["step"].ms))]
     return [
         ("forward + backward, ms", lambda backend: number(backend.speed.both_ms)),
-        ("whole step, ms", lambda backend: _ms(backend.speed.times["step"])),
+        ("whole step, ms", lambda backend: backend.speed.times["step"].text()),
         (f"{_REFERENCE} : this, forward + backward", speedup(lambda backend: backend.speed)),
         *(several if _has_several(scene) else []),
         ("Gpairs/s a core, forward", lambda backend: number(_core(backend).gpairs_per_s_forward)),
@@ -215,8 +201,8 @@ def _stages(where: str, scene: BenchedScene) -> Table:
         for part in speed.times:
             gpairs_per_s, fraction = rates.get(part, (None, None))
             rows.append((
-                f"{name} {part}", *([_ms(core.times.get(part))] if several else []),
-                _ms(speed.times[part]),
+                f"{name} {part}", *([core.times[part].text()] if several else []),
+                speed.times[part].text(),
                 *((number(gpairs_per_s), percent(fraction)) if part in rates else ("", ""))))
     threads = next(iter(scene.backends.values())).speed.threads
     columns = ("ms, 1 thread", f"ms, {threads} threads") if several else ("ms",)
@@ -236,11 +222,8 @@ def _accuracy_cells(accuracy: Accuracy) -> tuple[str, ...]:
 def _variants(where: str, scene: BenchedScene) -> Table:
     """Returns every approximation against the oracle, and the time it saves."""
     contract = scene.variants[0].time
-    rows = []
-    for variant in scene.variants:
-        saved = None if variant.time is None or contract is None else contract.ms - variant.time.ms
-        rows.append((variant.name, _ms(variant.time), number(saved, 2),
-                     *_accuracy_cells(variant.accuracy)))
+    rows = [(variant.name, variant.time.text(), number(contract.ms - variant.time.ms, 2),
+             *_accuracy_cells(variant.accuracy)) for variant in scene.variants]
     return Table(("what", "ms", "ms saved", *_ERRORS), rows,
                  f"Approximations on {scene.variants_of} ({where})")
 
@@ -259,10 +242,9 @@ def list_points(scene: BenchedScene) -> list[SpeedErrorPoint]:
     """Returns every backend, then every approximation that has a time."""
     contract, *others = scene.variants
     times = {name: backend.speed.both_ms for name, backend in scene.backends.items()}
-    if contract.time:  # taken in turn with the approximations
-        times[scene.variants_of] = contract.time.ms
+    times[scene.variants_of] = contract.time.ms  # taken in turn with the approximations
     timed = [*((name, times[name], backend.accuracy) for name, backend in scene.backends.items()),
-             *((other.name, other.time.ms, other.accuracy) for other in others if other.time)]
+             *((other.name, other.time.ms, other.accuracy) for other in others)]
     return [SpeedErrorPoint(name, ms, accuracy.image_error_rms, accuracy.gradient_relative_error)
             for name, ms, accuracy in timed]
 
@@ -370,7 +352,7 @@ def ratio(old: float | None, new: float | None) -> float | None:
 
 
 def machine_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Returns what differs between the machines of two records; empty where nothing does."""
+    """Returns the differences between the machines of two records; empty if there are none."""
     was, now = old["machine"], new["machine"]
     return "; ".join(f"{key} {was[key]} there, {now[key]} here"
                      for key in ("cpu", "cores", "lanes", "device") if was[key] != now[key])

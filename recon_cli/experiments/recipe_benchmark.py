@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,11 @@ import numpy as np
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError
-from recon_cli.evaluation.scores import Table, number
-from recon_cli.experiments.instruments import Host, timing_of
-from recon_cli.experiments.outputs import OutputFiles, add_legend, drawing
+from recon_cli.evaluation.scores import Table
+from recon_cli.experiments.instruments import Host, Timing
+from recon_cli.experiments.outputs import OutputFiles, Result, add_legend, drawing
 from recon_cli.experiments.runner import (
+    FIGURES,
     STEPS,
     CurvePoint,
     ExperimentRequest,
@@ -32,15 +33,10 @@ ALL = "all"  # the only comparison
 _SCORES = 20  # along a run: each is of all validation views
 _INCH = 3.2  # of a panel
 
-Figure = Callable[[CurvePoint], float]
-_WALL: tuple[str, Figure] = ("wall s", lambda point: point.seconds)
-_CPU: tuple[str, Figure] = ("CPU s", lambda point: point.cpu_seconds)
-_PSNR: tuple[str, Figure] = ("PSNR dB", lambda point: point.psnr_db)
-_SSIM: tuple[str, Figure] = ("SSIM", lambda point: point.ssim)
-_PANELS = (
-    (_WALL, _PSNR), (_CPU, _PSNR), (_WALL, _SSIM), (_CPU, _SSIM),
-    (_WALL, ("thousand Gaussians", lambda point: point.gaussians / 1e3)),
-    (_WALL, ("MB", lambda point: point.bytes / 1e6)))
+_PANELS = (  # figures across and up
+    ("seconds", "psnr_db"), ("cpu_seconds", "psnr_db"), ("seconds", "ssim"),
+    ("cpu_seconds", "ssim"), ("seconds", "gaussians"), ("seconds", "megabytes"))
+_CLOCKS = ("seconds", "cpu_seconds")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +46,7 @@ class RecipeRequest(ExperimentRequest):
     recipes: tuple[Variant, ...]
     iterations: int | None = None  # of every run; None where seconds or neither are given
     seconds: float | None = None  # of every run instead
-    targets_db: tuple[float, ...] = ()  # PSNR to reach; empty for what all runs of a scene reach
+    targets_db: tuple[float, ...] = ()  # PSNR to reach; empty for that of all runs
     outputs: OutputFiles = field(default_factory=OutputFiles)
 
     def __post_init__(self) -> None:
@@ -96,24 +92,26 @@ class CurvesResult:
         records, targets = scene.runs[ALL][recipe.name], self.targets_of(scene)
         return {
             **recipe.record(), "iterations": records[0].last.iteration,
-            **{key: {f"{db:g}": [seconds_to(record.points, db, clock) for record in records]
-                     for db in targets}
-               for key, (_, clock) in (("seconds_to", _WALL), ("cpu_seconds_to", _CPU))},
+            **{f"{clock}_to": {
+                f"{db:g}": [seconds_to(record.points, db, clock) for record in records]
+                for db in targets} for clock in _CLOCKS},
             "runs": [{"seed": seed, "points": [asdict(point) for point in record.points]}
                      for seed, record in enumerate(records)]}
 
 
-def run(request: RecipeRequest, progress: Progress) -> str:
-    """Trains every recipe, writes the files, and returns the text for the terminal."""
+def run(request: RecipeRequest, progress: Progress) -> Result:
+    """Trains every recipe, writes the files, and returns the result."""
     paths = check_scenes(request.scenes)
     runner = Runner(request.base, progress)
     with tempfile.TemporaryDirectory(prefix="recon-bench-") as scratch:
         host, scenes = request.load(paths, Path(scratch), "validation", progress)
-        result = CurvesResult(
+        curves = CurvesResult(
             host, request.seeds, request.base, request.targets_db, request.recipes,
             {loaded.folders.name: measure(loaded, request, runner) for loaded in scenes})
-    return request.outputs.write(
-        result.record(), head(result), tables(result), lambda path: draw(result, path))
+    result = Result(
+        curves.record(), head(curves), tables(curves), draw=lambda path: draw(curves, path))
+    request.outputs.write(result)
+    return result
 
 
 def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> SceneRuns:
@@ -123,7 +121,7 @@ def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> Scen
     runs = runner.run_all(
         loaded, request.recipes, request.seeds, steps, label=loaded.folders.name,
         score_at=score_steps)
-    return SceneRuns.of(loaded, {ALL: runs})
+    return SceneRuns.from_loaded(loaded, {ALL: runs})
 
 
 def score_steps(iterations: int, count: int = _SCORES) -> tuple[int, ...]:
@@ -131,17 +129,15 @@ def score_steps(iterations: int, count: int = _SCORES) -> tuple[int, ...]:
     return tuple(sorted({round(i * iterations / count) for i in range(count + 1)}))
 
 
-def seconds_to(points: Sequence[CurvePoint], target_db: float, clock: Figure) -> float | None:
+def seconds_to(points: Sequence[CurvePoint], target_db: float, clock: str) -> float | None:
     """Returns when a curve first reaches a PSNR, by linear interpolation, or None."""
-    before: CurvePoint | None = None
-    for point in points:
-        if point.psnr_db >= target_db:
-            if before is None:
-                return clock(point)
-            fraction = (target_db - before.psnr_db) / (point.psnr_db - before.psnr_db)
-            return clock(before) + fraction * (clock(point) - clock(before))
-        before = point
-    return None
+    psnr_db = [point.psnr_db for point in points]
+    end = next((i for i, value in enumerate(psnr_db) if value >= target_db), None)
+    if end is None:
+        return None
+    seconds = [FIGURES[clock].value(point) for point in points]
+    start = max(0, end - 1)
+    return float(np.interp(target_db, psnr_db[start:end + 1], seconds[start:end + 1]))
 
 
 def common_target(runs: Sequence[Sequence[CurvePoint]]) -> float:
@@ -166,28 +162,23 @@ def median_cell(values: Sequence[float | None], digits: int = 3) -> str:
     known = [value for value in values if value is not None]
     if 2 * len(known) <= len(values):
         return "-"
-    timing = timing_of(known)
-    cell = f"{number(timing.ms, digits)} ({number(timing.iqr_ms, 2)})"
+    cell = Timing.from_samples(known).text(digits)
     return cell if len(known) == len(values) else f"{cell}, {len(known)} of {len(values)}"
 
 
 def _table(name: str, scene: SceneRuns, result: CurvesResult) -> Table:
     targets = result.targets_of(scene)
-    header = ("recipe", *(f"{kind} to {db:g} dB" for db in targets for kind in ("s", "CPU s")),
-              "PSNR dB", "SSIM", "Gaussians", "MB", "steps", "s", "CPU s")
+    header = ("recipe", *(f"{FIGURES[clock].label} to {db:g} dB"
+                          for db in targets for clock in _CLOCKS), *(
+        figure.label for figure in FIGURES.values()))
 
     def row(recipe: str) -> tuple[str, ...]:
         records = scene.runs[ALL][recipe]
-
-        def last(figure: Figure, digits: int = 3) -> str:
-            return median_cell([figure(record.last) for record in records], digits)
-
         reached = [median_cell([seconds_to(record.points, db, clock) for record in records])
-                   for db in targets for _, clock in (_WALL, _CPU)]
-        return (
-            recipe, *reached, last(_PSNR[1], 4), last(_SSIM[1], 4),
-            last(lambda point: point.gaussians), last(lambda point: point.bytes / 1e6),
-            f"{records[0].last.iteration:,}", last(_WALL[1]), last(_CPU[1]))
+                   for db in targets for clock in _CLOCKS]
+        return (recipe, *reached, *(
+            median_cell([figure.value(record.last) for record in records],
+                        4 if name == "psnr_db" else 3) for name, figure in FIGURES.items()))
 
     title = (f"{name}: {scene.views} validation views at {scene.width}x{scene.height}, "
              f"at most {result.base.max_gaussians:,} Gaussians")
@@ -200,15 +191,16 @@ def draw(result: CurvesResult, path: Path) -> None:
     with drawing(path, _INCH * len(_PANELS), _INCH * rows + 0.5) as figure:
         panels = figure.subplots(rows, len(_PANELS), squeeze=False)
         for line, (name, scene) in zip(panels, result.scenes.items(), strict=True):
-            for axes, (across, up) in zip(line, _PANELS, strict=True):
+            for axes, panel in zip(line, _PANELS, strict=True):
+                across, up = (FIGURES[name] for name in panel)
                 for recipe, records in scene.runs[ALL].items():
-                    x, y = (np.array([[value(point) for point in record.points]
-                                      for record in records]) for _, value in (across, up))
+                    x, y = (np.array([[figure.value(point) for point in record.points]
+                                      for record in records]) for figure in (across, up))
                     curve, = axes.plot(
                         np.median(x, axis=0), np.median(y, axis=0), label=recipe, linewidth=1.2)
                     axes.fill_between(np.median(x, axis=0), y.min(axis=0), y.max(axis=0),
                                       color=curve.get_color(), alpha=0.2)
-                axes.set(xlabel=across[0], ylabel=up[0])
+                axes.set(xlabel=across.label, ylabel=up.label)
                 axes.grid(color="0.92")
             line[0].set_title(name, fontsize=10)
         add_legend(figure, panels[0][0])

@@ -11,14 +11,10 @@ import dataclasses
 import json
 import os
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
-
-import torch
 
 from recon_cli import __version__
 from recon_cli.config.settings import Settings
@@ -27,7 +23,7 @@ from recon_cli.context import StageContext, TrainCallback
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.evaluation.reference_views import mean_score
 from recon_cli.evaluation.scores import MeanScore
-from recon_cli.experiments.instruments import Host, examine
+from recon_cli.experiments.instruments import Clock, Host, examine
 from recon_cli.experiments.scenes import LoadedScene, load_for_training, open_scene
 from recon_cli.experiments.variants import MidPrune, TrainingRun, Variant
 from recon_cli.pipeline.execute import render_context
@@ -121,7 +117,7 @@ def base_config(
 
 
 def shared_options(base: RunConfig) -> dict[str, Any]:
-    """Returns the options that all variants share, without those that each run has of its own."""
+    """Returns the options that all variants share, without those that each run sets."""
     return {name: value for name, value in base.hashed_fields().items()
             if name not in _OWN - {"max_size", "max_gaussians", "sh_degree"}}
 
@@ -166,7 +162,7 @@ class SceneRuns:
     runs: Mapping[str, Runs]  # by comparison
 
     @staticmethod
-    def of(loaded: LoadedScene, runs: Mapping[str, Runs]) -> SceneRuns:
+    def from_loaded(loaded: LoadedScene, runs: Mapping[str, Runs]) -> SceneRuns:
         """Returns the runs on a scene."""
         camera = loaded.scored[0].camera
         return SceneRuns(len(loaded.scored), camera.width, camera.height, runs)
@@ -207,32 +203,47 @@ class Records:
 
     def run(self, key: str) -> Record | None:
         """Returns a finished run, None where there is none."""
-        value = self._values.get(key)
+        value = self.find(key)
         return None if value is None else Record(
             (CurvePoint(**value["point"]),), value["machine"], value["parts"])
 
-    def steps(self, key: str) -> Mapping[str, int] | None:
-        """Returns the steps that were fixed for each variant, None where they were not."""
-        value = self._values.get(key)
-        return None if value is None else value["steps"]
+    def find(self, key: str) -> Mapping[str, Any] | None:
+        """Returns the value that was added under a key, if any."""
+        return self._values.get(key)
 
     def add_run(self, key: str, record: Record, run: TrainingRun, scene: str) -> None:
         """Appends a finished run, with scene, variant and seed for readers of the file."""
-        self._add(key, {
+        self.add(key, {
             "point": asdict(record.last), "machine": record.machine, "parts": record.parts,
             "scene": scene, "arm": run.variant.name, "seed": run.seed})
 
-    def add_steps(self, key: str, steps: Mapping[str, int]) -> None:
-        """Appends the steps that variants take in equal seconds."""
-        self._add(key, {"steps": dict(steps)})
-
-    def _add(self, key: str, value: Mapping[str, Any]) -> None:
+    def add(self, key: str, value: Mapping[str, Any]) -> None:
+        """Appends a value, and returns when it is on the disk."""
         line = json.dumps({"version": _VERSION, "key": key, "value": value}) + "\n"
         with self._path.open("a", encoding="utf-8") as file:
             file.write(line)
             file.flush()
             os.fsync(file.fileno())
         self._values[key] = value
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number of a run at one of its points."""
+
+    label: str  # in tables
+    digits: int  # after the decimal point
+    value: Callable[[CurvePoint], float]
+
+
+FIGURES = {
+    "psnr_db": Figure("PSNR dB", 2, lambda point: point.psnr_db),
+    "ssim": Figure("SSIM", 4, lambda point: point.ssim),
+    "steps": Figure("steps", 0, lambda point: point.iteration),
+    "gaussians": Figure("Gaussians", 0, lambda point: point.gaussians),
+    "megabytes": Figure("MB", 1, lambda point: point.bytes / 1e6),
+    "seconds": Figure("s", 1, lambda point: point.seconds),
+    "cpu_seconds": Figure("CPU s", 1, lambda point: point.cpu_seconds)}
 
 
 class Runner:
@@ -297,35 +308,6 @@ class Runner:
         return record
 
 
-class TrainingClock:
-    """Measures wall and CPU seconds since its creation, without its pauses; waits for a GPU."""
-
-    def __init__(self, device: str) -> None:
-        self._device = device
-        self._start = self._now()
-
-    def seconds(self) -> tuple[float, float]:
-        """Returns the wall seconds, and the CPU seconds of all threads of this process."""
-        wall, cpu = self._now()
-        return wall - self._start[0], cpu - self._start[1]
-
-    @contextmanager
-    def pause(self) -> Iterator[None]:
-        """Excludes the time of the block."""
-        began = self._now()
-        try:
-            yield
-        finally:
-            ended = self._now()
-            self._start = (
-                self._start[0] + ended[0] - began[0], self._start[1] + ended[1] - began[1])
-
-    def _now(self) -> tuple[float, float]:
-        if self._device == "cuda":
-            torch.cuda.synchronize()
-        return time.perf_counter(), time.process_time()
-
-
 def score_as_ply(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, ctx: StageContext
 ) -> tuple[MeanScore, int]:
@@ -338,23 +320,19 @@ def score_as_ply(
     return mean_score(written, views, sh_degree, ctx.backend), size
 
 
-class _TrialCallback(TrainCallback):
-    """Calls `take_score` after certain steps, and `report_step` after each."""
+class _StepCallback(TrainCallback):
+    """Calls a function after each step."""
 
-    def __init__(
-        self, stops: Sequence[int], take_score: Callable[[], None], report_step: Callable[[], None]
-    ) -> None:
-        self._stops, self._take_score, self._report_step = stops, take_score, report_step
+    def __init__(self, after_step: Callable[[int], None]) -> None:
+        self._after_step = after_step
 
     def needs_step(self, iteration: int) -> bool:  # noqa: ARG002
         """Returns True: the progress bar counts every step."""
         return True
 
     def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
-        """Scores the model where that is due."""
-        self._report_step()
-        if iteration in self._stops:
-            self._take_score()
+        """Calls the function."""
+        self._after_step(iteration)
 
 
 def run_trial(
@@ -371,7 +349,7 @@ def run_trial(
         most=first_count(task.schedule.config, len(loaded.scene.points)))
     stops = sorted({*score_at, run.iterations})
     points: list[CurvePoint] = []
-    clock = TrainingClock(loaded.ctx.device)
+    clock = Clock(loaded.ctx.device)
 
     def take_score() -> None:
         wall, cpu = clock.seconds()
@@ -383,7 +361,12 @@ def run_trial(
             state.iteration, round(wall, 3), round(cpu, 3), len(splats), size, score.psnr_db,
             score.ssim))
 
-    callbacks = (_TrialCallback(stops, take_score, on_step),)
+    def after_step(iteration: int) -> None:
+        on_step()
+        if iteration in stops:
+            take_score()
+
+    callbacks = (_StepCallback(after_step),)
     if 0 in stops:
         take_score()
     prune = run.variant.prune

@@ -30,7 +30,7 @@ from recon_cli.train.train_data import load_task
 from recon_cli.workspace.digests import digest_file, sha256_json
 from recon_cli.workspace.layout import Workspace
 
-_READ = ("images", "denoised", "masks", "sparse")  # below sfm/undistorted, what training reads
+_READ = ("images", "denoised", "masks", "sparse")  # the inputs of training, below sfm/undistorted
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ it resumes like any other. seeds.json lies beside the stages: no stage becomes s
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
 import shutil
@@ -23,16 +22,15 @@ from recon_cli.errors import StageError, WorkspaceError
 from recon_cli.evaluation.comparison import ScoredModel, read_workspace_scores
 from recon_cli.evaluation.intervals import Spread
 from recon_cli.evaluation.scores import Table
+from recon_cli.experiments.outputs import Result
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.pipeline.plan import Target
 from recon_cli.stages import stage
-from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import SEEDS, Workspace, disk_errors, remove
 
-RESULT = "seeds.json"
 _FORMATS = {"psnr_db": ".2f", "ssim": ".4f", "gaussians": ",.0f", "train_seconds": ".0f"}
 _SEEDED = ("train", "prune")
 
@@ -48,10 +46,14 @@ class SeedScores:
     seeds: tuple[int, ...]
     models: Mapping[str, Figures]
     difference: Figures  # pruned minus base; empty where nothing is pruned
-    kinds: Mapping[str, str]  # what tables call each model
+    kinds: Mapping[str, str]  # the name of each model in tables
 
-    def table(self) -> Table:
-        """Returns mean and deviation of every figure."""
+    def result(self) -> Result:
+        """Returns mean and deviation of every figure, and the content of seeds.json."""
+        def spreads(figures: Figures) -> dict[str, Any]:
+            return {name: {"values": list(values), **dataclasses.asdict(Spread.of(values))}
+                    for name, values in figures.items()}
+
         def cells(figures: Figures, sign: str = "") -> list[str]:
             return [Spread.of(values).text(sign + _FORMATS[name])
                     for name, values in figures.items()]
@@ -59,33 +61,21 @@ class SeedScores:
         rows = [(self.kinds[name], *cells(figures)) for name, figures in self.models.items()]
         if self.difference:
             rows.append(("pruned minus base", *cells(self.difference, "+")))
-        return Table(("model", "PSNR dB", "SSIM", "Gaussians", "train s"), rows)
-
-    def record(self) -> dict[str, Any]:
-        """Returns what seeds.json holds."""
-        def spreads(figures: Figures) -> dict[str, Any]:
-            return {name: {"values": list(values), **dataclasses.asdict(Spread.of(values))}
-                    for name, values in figures.items()}
-
-        return {"seeds": list(self.seeds),
-                "models": {name: spreads(figures) for name, figures in self.models.items()},
-                "pruned_minus_base": spreads(self.difference)}
+        return Result(
+            {"seeds": list(self.seeds),
+             "models": {name: spreads(figures) for name, figures in self.models.items()},
+             "pruned_minus_base": spreads(self.difference)},
+            f"Mean and standard deviation over the seeds {', '.join(map(str, self.seeds))}, on the "
+            "same held-out views",
+            [Table(("model", "PSNR dB", "SSIM", "Gaussians", "train s"), rows)])
 
     def text(self, form: str) -> str:
         """Returns it as text, markdown, csv, latex or json."""
-        if form == "json":
-            return json.dumps(self.record(), indent=1)
-        if form == "csv":  # one row for each model and seed
-            rows = [f"{name},{seed}," + ",".join(f"{values[i]:.6f}" for values in figures.values())
-                    for name, figures in self.models.items() for i, seed in enumerate(self.seeds)]
-            return "\n".join([f"model,seed,{','.join(_FORMATS)}", *rows])
-        table = self.table()
-        if form == "latex":
-            return table.latex().rstrip()
-        note = (f"Mean and standard deviation over the seeds {', '.join(map(str, self.seeds))}, "
-                "on the same held-out views.")
-        body = table.markdown() if form == "markdown" else table.text(rule=True) + "\n"
-        return f"{body}\n{note}"
+        if form != "csv":
+            return self.result().format(form)
+        rows = [f"{name},{seed}," + ",".join(f"{values[i]:.6f}" for values in figures.values())
+                for name, figures in self.models.items() for i, seed in enumerate(self.seeds)]
+        return "\n".join([f"model,seed,{','.join(_FORMATS)}", *rows])
 
 
 def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
@@ -114,9 +104,9 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
             by_seed.append(_score_seed(job, {
                 "train": dataclasses.replace(train, seed=seed), **configs, "evaluate": config},
                 seed))
-        result = _collect(seeds, by_seed)
-        atomic.write_json(root / RESULT, result.record())
-    return result
+        scores = _collect(seeds, by_seed)
+        scores.result().save(root, "seeds")
+    return scores
 
 
 def _refuse_import(inspection: WorkspaceCheck, root: Path) -> None:

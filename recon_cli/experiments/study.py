@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import statistics
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,11 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread, paired_t
 from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
-from recon_cli.evaluation.scores import Table
+from recon_cli.evaluation.scores import Table, or_dash
 from recon_cli.experiments.instruments import Host
-from recon_cli.experiments.outputs import add_legend, draw_if_possible, drawing
+from recon_cli.experiments.outputs import Result, add_legend, drawing
 from recon_cli.experiments.runner import (
+    FIGURES,
     ExperimentRequest,
     Record,
     Records,
@@ -43,25 +44,17 @@ from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.layout import disk_errors, hold_lock
 
-# The paper compares the first two; the others are what `recon train` does without and with --prune.
+# The paper compares the first two; the others are `recon train` without and with --prune.
 VARIANTS: tuple[Variant, ...] = (REFERENCE, PAPER, BUDGET, BUDGET_PRUNED)
-BASELINE, DEFAULT = REFERENCE, BUDGET  # what the others are compared with
+BASELINE, DEFAULT = REFERENCE, BUDGET  # the others are compared with these
 PAIRS: tuple[tuple[Variant, Variant], ...] = (
     *((variant, BASELINE) for variant in VARIANTS if variant is not BASELINE),
     *((variant, DEFAULT) for variant in VARIANTS if variant not in (BASELINE, DEFAULT)))
 EQUAL_STEPS, EQUAL_SECONDS = COMPARISONS = ("equal steps", "equal seconds")
 MEAN = "all scenes"  # in place of a scene's name: the mean over scenes
-FIGURES = {
-    "psnr_db": lambda point: point.psnr_db, "ssim": lambda point: point.ssim,
-    "gaussians": lambda point: point.gaussians, "megabytes": lambda point: point.bytes / 1e6,
-    "seconds": lambda point: point.seconds, "cpu_seconds": lambda point: point.cpu_seconds,
-    "steps": lambda point: point.iteration}
 _NEAR = 0.05  # relative: the seconds of a repeated run differ by as much
 
-_UNITS = {"psnr_db": ("PSNR", "dB", 2), "ssim": ("SSIM", "", 4)}
-_COLUMNS = (("PSNR dB", "psnr_db", 2), ("SSIM", "ssim", 4))
-_COSTS = (("steps", "steps", 0), ("Gaussians", "gaussians", 0), ("MB", "megabytes", 1),
-          ("s", "seconds", 1), ("CPU s", "cpu_seconds", 1))
+SCORES = ("psnr_db", "ssim")  # the figures whose differences are shown
 _OFFSET = 0.18  # between the lines of two variants, where two scenes are 1 apart
 
 logger = logging.getLogger("recon")
@@ -74,8 +67,8 @@ TABLE_I: dict[str, PublishedScores] = {
     "office2": (36.39, 0.945, 36.68, 0.962), "office3": (35.85, 0.941, 36.35, 0.958),
     "office4": (36.54, 0.939, 36.66, 0.941), "room0": (37.26, 0.915, 38.06, 0.923),
     "room1": (36.28, 0.929, 37.75, 0.935), "room2": (34.98, 0.913, 35.14, 0.927)}
-_CAUTION = ("The paper names neither its frames, sizes, held-out views nor its count of runs: its "
-            "figures and those of this study are no measurement of the same thing.")
+_CAUTION = ("The paper names neither its frames, sizes, held-out views nor its number of runs: its "
+            "figures and those of this study do not measure the same thing.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +112,7 @@ class StudyResult:
         """Returns a figure by seed, of a scene or of the mean over all."""
         scenes = self.scenes.values() if row == MEAN else (self.scenes[row],)
         by_scene = [
-            [FIGURES[figure](record.last) for record in scene.runs[comparison][variant.name]]
+            [FIGURES[figure].value(record.last) for record in scene.runs[comparison][variant.name]]
             for scene in scenes]
         return [sum(values) / len(by_scene) for values in zip(*by_scene, strict=True)]
 
@@ -158,11 +151,11 @@ class StudyResult:
                          **asdict(self.spread(row, comparison, variant, figure))}
                 for figure in FIGURES} for variant in VARIANTS},
             "differences": {f"{pair[0].name} - {pair[1].name}": {
-                figure: interval(pair, figure) for figure in _UNITS} for pair in PAIRS}}
+                figure: interval(pair, figure) for figure in SCORES} for pair in PAIRS}}
 
 
-def run(request: StudyRequest, progress: Progress) -> str:
-    """Makes the missing runs, writes the files, and returns the text for the terminal."""
+def run(request: StudyRequest, progress: Progress) -> Result:
+    """Makes the missing runs, writes the files, and returns the result."""
     paths, out = check_scenes(request.scenes), request.out
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -177,14 +170,15 @@ def run(request: StudyRequest, progress: Progress) -> str:
         machine = f"{host.cpu}, {host.device}, {host.threads} threads"
         study = Study(request, records, progress, machine)
         logger.warning("%s", study.announcement(scenes))
-        result = StudyResult(
+        studied = StudyResult(
             host, request.seeds, request.base, request.clock,
             {loaded.folders.name: study.run_scene(loaded) for loaded in scenes},
             {loaded.folders.name: loaded.folders.digest for loaded in scenes})
-        atomic.write_json(out / "study.json", result.record())
-        atomic.write_text(out / "study.md", markdown(result))
-        draw_if_possible(lambda path: draw(result, path), out / "study.svg")
-    return text(result)
+        result = Result(studied.record(), head(studied), tables(studied), notes(studied),
+                        lambda path: draw(studied, path))
+        result.save(out, "study")
+        atomic.write_text(out / "study.md", f"# The paper's experiment\n\n{result.markdown()}\n")
+    return result
 
 
 def equal_seconds(iterations: int, seconds: Mapping[str, float]) -> dict[str, int]:
@@ -235,8 +229,8 @@ class Study:
 
     def _count_missing(self, loaded: LoadedScene, variant: Variant) -> int:
         """Returns how many runs of a variant are missing; those of unknown steps are, too."""
-        steps = [{variant.name: self._request.iterations},
-                 self._records.steps(self._steps_key(loaded))]
+        fixed = self._records.find(self._steps_key(loaded))
+        steps = [{variant.name: self._request.iterations}, fixed and fixed["steps"]]
         return sum(
             by_variant is None or self._runner.find_record(loaded, TrainingRun(
                 variant, self._request.base, by_variant[variant.name], seed)) is None
@@ -248,7 +242,7 @@ class Study:
         equal = self._run_all(loaded, EQUAL_STEPS, steps)
         runs = {EQUAL_STEPS: equal,
                 EQUAL_SECONDS: self._run_all(loaded, EQUAL_SECONDS, self._steps(loaded, equal))}
-        return SceneRuns.of(loaded, runs)
+        return SceneRuns.from_loaded(loaded, runs)
 
     def _run_all(self, loaded: LoadedScene, comparison: str, steps: Mapping[str, int]) -> Runs:
         return self._runner.run_all(
@@ -258,8 +252,8 @@ class Study:
     def _steps(self, loaded: LoadedScene, equal: Runs) -> Mapping[str, int]:
         """Returns the steps at equal seconds: fixed ones, or a guess corrected by one run each."""
         key, count = self._steps_key(loaded), self._request.iterations
-        if (fixed := self._records.steps(key)) is not None:
-            return fixed
+        if (fixed := self._records.find(key)) is not None:
+            return dict(fixed["steps"])
         seconds = {name: statistics.median(self._seconds(record) for record in records)
                    for name, records in equal.items()}
         steps = equal_seconds(count, seconds)
@@ -271,11 +265,12 @@ class Study:
                     loaded, guess, (), bar.advance)
                 steps[name] = correct_steps(
                     count, steps[name], seconds[name], self._seconds(record), max(seconds.values()))
-        self._records.add_steps(key, steps)
+        self._records.add(key, {"steps": steps})
         return steps
 
     def _seconds(self, record: Record) -> float:
-        return record.last.cpu_seconds if self._request.clock == "cpu" else record.last.seconds
+        clock = "cpu_seconds" if self._request.clock == "cpu" else "seconds"
+        return FIGURES[clock].value(record.last)
 
     def _steps_key(self, loaded: LoadedScene) -> str:
         """Returns the key of the steps at equal seconds, whatever the number of seeds."""
@@ -285,32 +280,16 @@ class Study:
         return sha256_json({"steps of": first, "clock": request.clock})
 
 
-def text(result: StudyResult) -> str:
-    """Returns the text for the terminal."""
-    return "\n\n".join([head(result), *_sections(result, Table.text, lambda _title: [])])
-
-
-def markdown(result: StudyResult) -> str:
-    """Returns study.md."""
-    sections = _sections(result, Table.markdown, lambda title: [f"## {title}"])
-    return "\n\n".join(["# The paper's experiment", head(result) + ".", *sections]) + "\n"
-
-
-def _sections(
-    result: StudyResult, render: Callable[[Table], str], heading: Callable[[str], list[str]]
-) -> list[str]:
-    """Returns tables, sentences and notes, each table rendered by `render`."""
-    parts = []
-    for comparison in COMPARISONS:
-        parts += [*heading(f"At {comparison}"), render(scores(result, comparison)),
-                  render(differences(result, comparison)), words(result, comparison)]
-    if (table := beside_the_paper(result)) is not None:
-        parts += [*heading("Beside the paper"), render(table), _CAUTION]
-    return [*parts, *notes(result)]
+def tables(result: StudyResult) -> list[Table]:
+    """Returns scores and differences of each comparison, and the paper's scores if they apply."""
+    found = [make(result, comparison)
+             for comparison in COMPARISONS for make in (scores, differences)]
+    beside = beside_the_paper(result)
+    return found if beside is None else [*found, beside]
 
 
 def head(result: StudyResult) -> str:
-    """Returns what was run and where."""
+    """Returns a line on the runs and their machines."""
     scenes = "; ".join(
         f"{name}: {scene.views} test views at {scene.width}x{scene.height}"
         for name, scene in result.scenes.items())
@@ -320,16 +299,16 @@ def head(result: StudyResult) -> str:
 
 def scores(result: StudyResult, comparison: str) -> Table:
     """Returns the table of means and standard deviations."""
-    header = ("scene, arm", *(name for label, _, _ in _COLUMNS for name in (label, "sd")),
-              *(label for label, _, _ in _COSTS))
+    header = ("scene, arm", *(
+        label for name, figure in FIGURES.items()
+        for label in ((figure.label, "sd") if name in SCORES else (figure.label,))))
 
     def cells(row: str, variant: Variant) -> Iterator[str]:
-        for _, figure, digits in _COLUMNS:
-            spread = result.spread(row, comparison, variant, figure)
-            yield f"{spread.mean:.{digits}f}"
-            yield "-" if spread.deviation is None else f"{spread.deviation:.{digits}f}"
-        for _, figure, digits in _COSTS:
-            yield f"{result.spread(row, comparison, variant, figure).mean:,.{digits}f}"
+        for name, figure in FIGURES.items():
+            spread = result.spread(row, comparison, variant, name)
+            yield f"{spread.mean:,.{figure.digits}f}"
+            if name in SCORES:
+                yield or_dash(spread.deviation, f".{figure.digits}f")
 
     return Table(header, [
         (f"{row}, {variant.label}", *cells(row, variant))
@@ -338,42 +317,18 @@ def scores(result: StudyResult, comparison: str) -> Table:
 
 def differences(result: StudyResult, comparison: str) -> Table:
     """Returns the table of paired differences with their intervals."""
+    def cells(row: str, pair: tuple[Variant, Variant]) -> Iterator[str]:
+        for name in SCORES:
+            interval = result.difference(row, comparison, pair, name)
+            for value in (interval.mean, interval.low, interval.high):
+                yield or_dash(value, f"+.{FIGURES[name].digits}f")
+            yield interval.verdict
+
     header = ("scene, arm - arm", *(
-        name for label, _, _ in _COLUMNS for name in (label, "95% from", "to")))
-    rows = [(f"{row}, {pair[0].label} - {pair[1].label}", *(
-        cell for _, figure, digits in _COLUMNS for cell in _interval_cells(
-            result.difference(row, comparison, pair, figure), digits)))
-        for row in result.rows for pair in PAIRS]
-    return Table(header, rows, f"Differences at {comparison}")
-
-
-def _interval_cells(interval: Interval, digits: int) -> list[str]:
-    return ["-" if value is None else f"{value:+.{digits}f}"
-            for value in (interval.mean, interval.low, interval.high)]
-
-
-def words(result: StudyResult, comparison: str) -> str:
-    """Returns one sentence a pair of variants and figure, on the mean of all scenes."""
-    row = MEAN if MEAN in result.rows else result.rows[0]
-    return "\n".join(f"- {_sentence(result, row, comparison, pair, figure)}"
-                     for pair in PAIRS for figure in _UNITS)
-
-
-def _sentence(
-    result: StudyResult, row: str, comparison: str, pair: tuple[Variant, Variant], figure: str
-) -> str:
-    name, unit, digits = _UNITS[figure]
-    difference = result.difference(row, comparison, pair, figure)
-    mean, low, high = _interval_cells(difference, digits)
-    lead = (f"{name} of {pair[0].label} against {pair[1].label}, {row}, {comparison}: "
-            f"{mean}{f' {unit}' if unit else ''}")
-    if difference.low is None or difference.high is None:
-        return f"{lead}; one seed shows no interval."
-    if difference.low <= 0 <= difference.high:
-        return f"{lead}; the interval [{low}, {high}] contains 0: no difference shown."
-    side = "above" if difference.low > 0 else "below"
-    return (f"{lead}; the interval [{low}, {high}] lies {side} 0: {pair[0].label} is "
-            f"{difference.verdict}.")
+        label for name in SCORES for label in (FIGURES[name].label, "95% from", "to", "so it is")))
+    return Table(header, [
+        (f"{row}, {pair[0].label} - {pair[1].label}", *cells(row, pair))
+        for row in result.rows for pair in PAIRS], f"Differences at {comparison}")
 
 
 def beside_the_paper(result: StudyResult) -> Table | None:
@@ -393,7 +348,7 @@ def _row_beside_the_paper(
         return f"{psnr_db:{sign}.2f}", f"{ssim:{sign}.3f}"
 
     base, paper = (
-        [result.spread(scene, EQUAL_STEPS, variant, figure).mean for figure in _UNITS]
+        [result.spread(scene, EQUAL_STEPS, variant, figure).mean for figure in SCORES]
         for variant in (BASELINE, PAPER))
     return (
         scene, *pair(*published[:2]), *pair(*published[2:]),
@@ -421,7 +376,7 @@ def notes(result: StudyResult) -> list[str]:
         return ", ".join(f"{parts} ({' and '.join(names)})" for parts, names in labels.items())
 
     clock = {"wall": "on the wall", "cpu": "of the CPU"}[result.clock]
-    count = len(result.rows) * len(PAIRS) * len(_COLUMNS) * len(COMPARISONS)
+    count = len(result.rows) * len(PAIRS) * len(SCORES) * len(COMPARISONS)
     lines = [
         f"Equal seconds: each arm takes as many steps as fit into the seconds {clock} that the "
         "slowest arm's take at equal steps, as measured first; the steps are "
@@ -429,11 +384,13 @@ def notes(result: StudyResult) -> list[str]:
         "Each arm is trained on " + "; ".join(
             f"{scene}: {list_parts(scene)}" for scene in result.scenes)
         + ". The trials that decide so are not timed.",
-        "Intervals: 95% by Student's t over the differences seed by seed. They are about other "
-        f"seeds on these scenes, not of other scenes. Of {count} intervals about "
+        "Intervals: 95% by Student's t over the differences seed by seed. They cover other seeds "
+        f"on these scenes, not other scenes. Of {count} intervals about "
         f"{max(1, round(0.05 * count))} would leave out 0 by chance if no arm differed.",
         f"PSNR: {PSNR_CONVENTION}. SSIM: {SSIM_CONVENTION}. Scored on held-out test views, which "
         "nothing was tuned on."]
+    if beside_the_paper(result) is not None:
+        lines.insert(0, _CAUTION)
     if result.seeds < 5:
         lines.append(f"{result.seeds} seeds are few: a claim needs 5.")
     if len(result.machines) > 1:
@@ -444,11 +401,11 @@ def notes(result: StudyResult) -> list[str]:
 def draw(result: StudyResult, path: Path) -> None:
     """Draws means and intervals into a .png or .svg; a cross is the gain in the paper."""
     with drawing(path, 13, 2 + 1.4 * len(result.rows)) as figure:
-        panels = figure.subplots(len(_UNITS), len(COMPARISONS), squeeze=False, sharey=True)
-        for line, (label, name, _) in zip(panels, _COLUMNS, strict=True):
+        panels = figure.subplots(len(SCORES), len(COMPARISONS), squeeze=False, sharey=True)
+        for line, name in zip(panels, SCORES, strict=True):
             for axes, comparison in zip(line, COMPARISONS, strict=True):
                 _draw_panel(axes, result, comparison, name)
-                axes.set(xlabel=f"{label} against 3DGS", title=comparison)
+                axes.set(xlabel=f"{FIGURES[name].label} against 3DGS", title=comparison)
         add_legend(figure, panels[0][0])
         figure.suptitle(f"{result.seeds} seeds, 95% intervals", fontsize=10)
 

@@ -1,8 +1,7 @@
 """`recon prune --sweep`: quality after pruning by every score to every ratio, with controls.
 
 One control removes at random. The others remove nothing: one takes as many steps, the others as
-many seconds. sweep.json and
-sweep.svg lie in the workspace beside the stages, so that no stage becomes stale.
+many seconds. sweep.json and sweep.svg lie beside the stages, so that no stage becomes stale.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from recon_cli.context import StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.evaluation.reference_views import mean_score
 from recon_cli.evaluation.scores import MeanScore, Sweep, SweepTrial, Table
-from recon_cli.experiments.outputs import draw_if_possible, drawing
+from recon_cli.experiments.outputs import Result, drawing
 from recon_cli.experiments.runner import run_grid
 from recon_cli.pipeline import execute, plan
 from recon_cli.pipeline.execute import Job
@@ -30,16 +29,14 @@ from recon_cli.train.prune_loop import PruneRun, prune_loop, remaining
 from recon_cli.train.prune_run import PruneSource, load_prune_source
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
-from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 
-PICTURE = "sweep.svg"
 SCORES = (*PRUNE_SCORES, RANDOM)
 _WARM_STEPS = 10  # before anything is timed: the first steps load kernels and make buffers
 
 
-def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
-    """Writes sweep.json and sweep.svg into the workspace and returns the table.
+def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> Result:
+    """Writes sweep.json and sweep.svg into the workspace and returns the result.
 
     The options are those of `recon prune`, except for score, ratio and limits; each ratio is the
     fraction to remove, in (0, 1).
@@ -65,16 +62,18 @@ def run_sweep(job: Job, config: PruneConfig, ratios: Sequence[float]) -> str:
         with job.progress.bar("sweep", count_trials(ratios), unit="run") as bar:
             trials = sweep(source, ratios, on_trial=bar.advance)
         train = job.workspace.manifest("train")
-        atomic.write_json(root / Sweep.FILE, Sweep(
+        found = Sweep(
             of_train=train.digest if train else None, validation_views=views, at=config.at,
             rounds=source.rounds, recovery_steps=steps, equal_seconds_of=config.score,
-            before=before, trials=tuple(trials)).to_json())
-        draw_if_possible(lambda path: draw(trials, before.psnr_db, path), root / PICTURE)
-    return (
-        f"PSNR in dB and SSIM on {views} validation views, right after the last removal and after "
-        f"{steps} steps of recovery with up to {source.rounds} rounds. Before: "
-        f"{len(state.splats):,} Gaussians, {before.psnr_db:.2f}, {before.ssim:.4f}.\n\n"
-        f"{table(trials, config.score)}")
+            before=before, trials=tuple(trials))
+        result = Result(
+            found.to_json(),
+            f"PSNR in dB and SSIM on {views} validation views, right after the last removal and "
+            f"after {steps} steps of recovery with up to {source.rounds} rounds. Before: "
+            f"{len(state.splats):,} Gaussians, {before.psnr_db:.2f}, {before.ssim:.4f}.",
+            [table(trials, config.score)], draw=lambda path: draw(trials, before.psnr_db, path))
+        result.save(root, "sweep")
+    return result
 
 
 def count_trials(ratios: Sequence[float]) -> int:
@@ -152,8 +151,8 @@ def _score_validation(state: TrainState, task: Task) -> MeanScore:
     return mean_score(state.splats, task.validation, degree, task.backend)
 
 
-def table(trials: Sequence[SweepTrial], score: str) -> str:
-    """Returns the trials as a table; a control is named by what it has in common with them."""
+def table(trials: Sequence[SweepTrial], score: str) -> Table:
+    """Returns the trials as a table; a control is named by the quantity that equals theirs."""
     def cells(scores: MeanScore | None) -> tuple[str, str]:
         return ("-", "-") if scores is None else (f"{scores.psnr_db:.2f}", f"{scores.ssim:.4f}")
 
@@ -167,7 +166,7 @@ def table(trials: Sequence[SweepTrial], score: str) -> str:
     rows = [(*name(trial), f"{trial.gaussians:,}", f"{trial.steps}", f"{trial.seconds:.1f}",
              *cells(trial.removed), *cells(trial.recovered)) for trial in trials]
     return Table(("score", "removed", "Gaussians", "steps", "seconds", "PSNR removed",
-                  "SSIM removed", "PSNR recovered", "SSIM recovered"), rows).text()
+                  "SSIM removed", "PSNR recovered", "SSIM recovered"), rows)
 
 
 def draw(trials: Sequence[SweepTrial], before_db: float, path: Path) -> None:

@@ -9,50 +9,41 @@ blocks, with the CPU seconds of each training.
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import click
 import numpy as np
 from numpy.typing import NDArray
+from workbench import (
+    numba_context,
+    open_trained,
+    print_head,
+    print_row,
+    run_recon,
+    stage_folders,
+    workspace_argument,
+)
 
-from recon_cli.context import StageContext, StageInputs
+from recon_cli.context import StageInputs
 from recon_cli.evaluation.reference_views import load_reference_views, score_views
-from recon_cli.io.training_scene import load_scene
 from recon_cli.io.views import ReferenceView
 from recon_cli.scene.cells import Cell
 from recon_cli.splats.ply import read_ply
 from recon_cli.train.blocks import cut_blocks
-from recon_cli.train.train_data import read_config
 
 PLACES = 500  # that are drawn around a camera
 SEED = 0
 
 
-@dataclass(frozen=True)
-class Trained:
-    """A finished training."""
-
-    name: str
-    workspace: Path
-    cpu_seconds: float
-
-
-def run_in_copy(
-    name: str, source: Path, out: Path, words: list[str], leave: tuple[str, ...]
-) -> Trained:
-    """Runs a command on a copy of a workspace without some of its folders."""
+def train_copy(source: Path, out: Path, words: list[str]) -> float:
+    """Trains a copy of a workspace, and returns the CPU seconds."""
     if not out.exists():
-        shutil.copytree(source, out, ignore=shutil.ignore_patterns(*leave, ".lock"))
-    before = os.times()
-    subprocess.run([sys.executable, "-m", "recon_cli", *words, "-w", str(out)], check=True)
-    after = os.times()
-    return Trained(name, out, after.children_user + after.children_system
-                   - before.children_user - before.children_system)
+        shutil.copytree(source, out, ignore=shutil.ignore_patterns("train", "prune", ".lock"))
+    done = run_recon(out, "train", *words)
+    if done.code:
+        raise click.ClickException(done.error)
+    return done.cpu_seconds
 
 
 def score_model(
@@ -80,7 +71,7 @@ def near_border(cells: list[Cell], centre: NDArray[np.float64], reach: float) ->
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspace_argument
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option("--blocks", default=3, show_default=True)
 @click.option("--iterations", default=1500, show_default=True, help="Steps of each block.")
@@ -94,31 +85,25 @@ def main(
 ) -> None:
     """Print the scores of WORKSPACE trained in blocks and as one model."""
     common = ["--max-size", str(max_size), "--no-early-stop", *settings]
-    untrained = ("train", "prune")
-    parts = run_in_copy("blocks", workspace, out / "blocks", [
-        "train", "--blocks", str(blocks), "--iterations", str(iterations), "--max-gaussians",
-        str(max_gaussians), *common], untrained)
-    merged = len(read_ply(parts.workspace / "train" / "splats.ply"))
-    whole = run_in_copy("one model", workspace, out / "whole", [
-        "train", "--blocks", "off", "--iterations",
-        str(read_config(parts.workspace / "train").iterations), "--max-gaussians", str(merged),
-        *common], untrained)
-    ctx = StageContext(backend="numba")
-    folders = {name: workspace / name for name in ("ingest", "denoise", "sfm")}
-    config, inputs = read_config(parts.workspace / "train"), StageInputs(folders)
-    scene = load_scene(inputs.folders, validation=config.validation)
-    views = load_reference_views(scene.test, max_size, ctx)
+    places = {"one model": out / "whole", "blocks": out / "blocks"}
+    seconds = {"blocks": train_copy(workspace, places["blocks"], [
+        "--blocks", str(blocks), "--iterations", str(iterations), "--max-gaussians",
+        str(max_gaussians), *common])}
+    config, scene, merged = open_trained(places["blocks"])
+    seconds["one model"] = train_copy(workspace, places["one model"], [
+        "--blocks", "off", "--iterations", str(config.iterations), "--max-gaussians",
+        str(len(merged)), *common])
+    views = load_reference_views(scene.test, max_size, numba_context())
+    inputs = StageInputs(stage_folders(workspace))
     cells = [job.cell for job in cut_blocks(config, blocks, scene, inputs, out / "cut")]
     border = np.array([near_border(cells, view.camera.center, near) for view in views])
     click.echo(f"{len(views)} held-out views, {border.sum()} within {near:g} of a border\n")
-    click.echo("| model | Gaussians | PSNR / SSIM | near a border | CPU s |\n"
-               "|---|---:|---:|---:|---:|")
-    for trained in (whole, parts):
-        count, psnr, ssim = score_model(trained.workspace / "train" / "splats.ply", views)
+    print_head("model", "Gaussians", "PSNR / SSIM", "near a border", "CPU s")
+    for name, place in places.items():
+        count, psnr, ssim = score_model(place / "train" / "splats.ply", views)
         columns = [f"{psnr[rows].mean():.2f} / {ssim[rows].mean():.3f}" if rows.any() else ""
                    for rows in (np.ones(len(views), bool), border)]
-        click.echo(f"| {trained.name} | {count:,} | {columns[0]} | {columns[1]} "
-                   f"| {trained.cpu_seconds:.0f} |")
+        print_row(name, f"{count:,}", *columns, f"{seconds[name]:.0f}")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import click
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from workbench import FOLDER
 
 from recon_cli.capture.panoramas import wraps_around
 from recon_cli.capture.repeats import SAME_PICTURE, measure_shift
@@ -123,7 +124,7 @@ def cut(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @click.command()
-@click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("data", type=FOLDER)
 def main(data: Path) -> None:
     """Prints both tables."""
     for rows in (repeat_rows(data), panorama_rows(data)):

@@ -9,7 +9,6 @@ to run only those, or files and folders that are not in DATA.
 from __future__ import annotations
 
 import itertools
-import json
 import re
 import subprocess
 import sys
@@ -23,8 +22,9 @@ import numpy as np
 import pycolmap
 from damaged_videos import CHANGES, bare, damaged, still, turning
 from PIL import Image
-from pose_errors import Poses, compare, model_poses, reference_poses
+from pose_errors import Poses, compare, model_poses, reference_poses, trident_poses
 from scipy.spatial.transform import Rotation
+from workbench import FOLDER, print_head, print_row, read_json, run_recon
 
 from recon_cli.capture.decoded_picture import Gap
 from recon_cli.capture.video import decode
@@ -77,13 +77,8 @@ def fox(data: Path, _out: Path) -> Poses:
 
 
 def trident(data: Path, _out: Path) -> Poses:
-    """Poses that others found; frame k of the video is file k + 1, axes are OpenGL's."""
-    path = data / "walks" / "trident_desk" / "transforms_train.json"
-    frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
-    return {
-        f"{int(''.join(filter(str.isdigit, Path(frame['file_path']).stem))) - 1:06d}.png":
-            np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        for frame in frames}
+    """Poses that others found."""
+    return trident_poses(data)
 
 
 def rpy(data: Path, _out: Path) -> Poses:
@@ -105,7 +100,7 @@ def lockers(data: Path, out: Path) -> Poses:
     images = (model.image(number) for number in model.reg_image_ids())
     poses = {Path(image.name).name: np.vstack(
         [image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]]) for image in images}
-    listed = json.loads((out / "ws" / "ingest" / "frames.json").read_text(encoding="utf-8"))
+    listed = read_json(out / "ws" / "ingest" / "frames.json")
     return {frame["name"]: poses[frame["source"]] for frame in listed["frames"]
             if frame["source"] in poses}
 
@@ -144,31 +139,10 @@ def noisy_fox(data: Path, out: Path) -> Path:
 
 def blurred_video(data: Path, out: Path) -> Path:
     """880 frames of office, 269 of them blurred."""
-    called("bench_frame_choice.py", data / "rooms" / "office", out)
+    subprocess.run([
+        sys.executable, str(Path(__file__).with_name("bench_frame_choice.py")),
+        str(data / "rooms" / "office"), str(out)], check=True)
     return out / "video.mp4"
-
-
-def dng(data: Path, out: Path) -> Path:
-    """Snowmiku as camera RAW, exposures a stop up and down."""
-    called("make_dng_set.py", data / "snowmiku_photos", out / "photos")
-    return out / "photos"
-
-
-def large_walk(_data: Path, out: Path) -> Path:
-    """200 views of 1280x720 of office, once that is trained."""
-    workspace = out.parent / "office" / "ws"
-    if not (workspace / "train" / "splats.ply").exists():
-        code, error = ran(workspace, "train")
-        if code:
-            raise click.ClickException(f"office, which is to be mapped before: {error}")
-    called("make_large_walk.py", workspace, out / "photos")
-    return out / "photos"
-
-
-def called(script: str, *arguments: Path) -> None:
-    """Runs a script that lies beside this one."""
-    subprocess.run(
-        [sys.executable, str(Path(__file__).with_name(script)), *map(str, arguments)], check=True)
 
 
 CAPTURES = {
@@ -187,8 +161,6 @@ CAPTURES = {
     "house entry": Capture(given("video_house_entry/video.mp4")),
     "desk": Capture(given("desk_monitors/images")),
     "snowmiku": Capture(given("snowmiku_photos")),
-    "snowmiku, DNG": Capture(dng),
-    "large walk": Capture(large_walk),
     "trident": Capture(given("walks/trident_desk/video.mp4"), trident),
     "bonsai": Capture(given("walks/bonsai/images")),
     "living room loop": Capture(given("walks/living_room_loop/video.mp4")),
@@ -219,16 +191,6 @@ CAPTURES = {
 }
 
 
-def ran(workspace: Path, verb: str, *arguments: str) -> tuple[int, str]:
-    """Runs a verb as a user does; returns its exit code and its first error line."""
-    done = subprocess.run(
-        [sys.executable, "-m", "recon_cli", verb, *arguments, "-w", str(workspace)],
-        stderr=subprocess.PIPE, text=True)
-    click.echo(done.stderr, err=True, nl=False)
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]
-    return done.returncode, errors[0] if errors else ""
-
-
 def measured(name: str, data: Path, out: Path) -> list[str]:
     """Returns the row of a capture."""
     capture = CAPTURES[name] if name in CAPTURES else Capture(lambda *_: Path(name).resolve())
@@ -236,14 +198,14 @@ def measured(name: str, data: Path, out: Path) -> list[str]:
     out.mkdir(parents=True, exist_ok=True)
     sources: dict[str, tuple[str, ...]] = {"ingest": (str(capture.source(data, out)),)}
     for verb in ("ingest", "denoise", "sfm"):
-        code, error = ran(
+        done = run_recon(
             workspace, verb, *sources.get(verb, ()), *capture.options.get(verb, ()))
-        if code:
-            return [name, *[""] * (len(HEADINGS) - 2), f"exit {code}: {error}"]
-    manifest = json.loads((workspace / "sfm" / "manifest.json").read_text(encoding="utf-8"))
+        if done.code:
+            return [name, *[""] * (len(HEADINGS) - 2), f"exit {done.code}: {done.error}"]
+    manifest = read_json(workspace / "sfm" / "manifest.json")
     cells = accuracy(capture, data, out)
     summary = manifest["summary"]
-    verdict = json.loads((workspace / "sfm" / "verdict.json").read_text(encoding="utf-8"))
+    verdict = read_json(workspace / "sfm" / "verdict.json")
     return [
         name, str(summary["frames"]), str(summary["registered"]), str(len(summary["left_out"])),
         next((rung["name"] for rung in summary["rungs"] if rung["kept"]), "given poses"),
@@ -272,17 +234,17 @@ def accuracy(capture: Capture, data: Path, out: Path) -> tuple[str, str, str]:
 
 
 @click.command()
-@click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("data", type=FOLDER)
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
 @click.argument("names", nargs=-1)
 def main(data: Path, out: Path, names: tuple[str, ...]) -> None:
     """Prints a Markdown table, a row as soon as it is known."""
-    click.echo(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}")
+    print_head(*HEADINGS)
     for name in names or CAPTURES:
         if name not in CAPTURES and not Path(name).exists():
             raise click.BadParameter(f"{name} is neither a file nor one of {', '.join(CAPTURES)}.")
         folder = out.resolve() / re.sub(r"[^\w.]+", "_", name).strip("_")
-        click.echo(f"| {' | '.join(measured(name, data.resolve(), folder))} |")
+        print_row(*measured(name, data.resolve(), folder))
 
 
 if __name__ == "__main__":

@@ -16,19 +16,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from workbench import open_trained, workspaces_argument
 
 from recon_cli.context import StageContext
 from recon_cli.export.cleanup import count_sightings, find_floaters, find_islands
 from recon_cli.export.verify import load_reference_psnr
-from recon_cli.io.training_scene import load_scene
 from recon_cli.render import render
 from recon_cli.render.registry import resolve
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, Splats, joined
 from recon_cli.scene.train_view import TrainView
-from recon_cli.splats.ply import read_ply
-from recon_cli.train.train_data import load_views, read_config
+from recon_cli.train.train_data import load_views
 
 PLANTED = 60
 
@@ -75,18 +74,15 @@ def emptiest(splats: Splats, scene: Scene, draw: np.random.Generator) -> NDArray
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True, type=click.Path(path_type=Path))
+@workspaces_argument
 def main(workspaces: tuple[Path, ...]) -> None:
     """Prints some lines for each workspace."""
     backend, device = resolve("auto", "cpu")
     ctx = StageContext(backend=backend, device=device)
     for root in workspaces:
-        config, draw = read_config(root / "train"), np.random.default_rng(0)
-        scene = load_scene({name: root / name for name in ("ingest", "sfm")},
-                           validation=config.validation)
+        (config, scene, splats), draw = open_trained(root), np.random.default_rng(0)
         views, held = load_views(scene.train, config, ctx), load_reference_psnr(
             scene, Similarity(), config.max_size, ctx)
-        splats = read_ply(root / "train" / "splats.ply")
         clean = held.psnr_db(splats)
         spoilt = added(splats, *before_views(splats, views, ctx, draw), draw)
         for name, (whole, planted) in (

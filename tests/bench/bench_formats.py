@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import click
+from workbench import print_head, print_row
 
 from recon_cli.render.registry import use_threads
 from recon_cli.splats.registry import FORMATS, read_splats
@@ -22,8 +23,8 @@ from recon_cli.splats.registry import FORMATS, read_splats
 def main(files: tuple[Path, ...]) -> None:
     """Print bytes a Gaussian and seconds for each file and format."""
     use_threads("torch", 1)
-    click.echo("| scene | Gaussians | degree | format | bytes a Gaussian | write s | read s |\n"
-               "|---|---:|---:|---|---:|---:|---:|")
+    print_head(
+        "scene", "Gaussians", "degree", "format", "bytes a Gaussian", "write s", "read s")
     for file in files:
         splats = read_splats(file)
         for name, form in FORMATS.items():
@@ -35,10 +36,9 @@ def main(files: tuple[Path, ...]) -> None:
                 written = time.process_time()
                 form.read(path)
                 read = time.process_time()
-                click.echo(
-                    f"| {file.name} | {len(splats):,} | {splats.sh_degree} | {name} "
-                    f"| {path.stat().st_size / len(splats):.2f} | {written - begin:.2f} "
-                    f"| {read - written:.2f} |")
+                print_row(file.name, f"{len(splats):,}", str(splats.sh_degree), name,
+                          f"{path.stat().st_size / len(splats):.2f}", f"{written - begin:.2f}",
+                          f"{read - written:.2f}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""Everything about a GPU in one run: `python tests/bench/bench_gpu.py --room FOLDER`.
+"""The triton backend on a GPU: `python tests/bench/bench_gpu.py`.
 
-Builds the kernels, checks them, and measures pictures, gradients, training steps, memory, how far
-each stage is from what the device could do at best, and how soon a room has its full quality. Each
+Builds the kernels, checks them, and measures pictures, gradients, training steps and memory. Each
 figure is printed at once; a table of all of them comes last. Exit code 1 where a check failed or a
 part broke off. docs/bench.md says how things are measured.
 
@@ -21,8 +20,6 @@ from pathlib import Path
 
 import click
 import gpu_checks
-import gpu_floor
-import gpu_room
 import gpu_speed
 import torch
 from gpu_clock import clear
@@ -55,7 +52,6 @@ def parts(
         ("pictures", "pictures", lambda: gpu_speed.pictures(figures, whole, rounds)),
         ("gsplat", "gsplat", lambda: gpu_speed.gsplat(figures, whole, rounds)),
         ("steps", "steps", lambda: gpu_speed.steps(figures, whole, rounds, stretch)),
-        ("floor", "floor", lambda: gpu_floor.run(figures, whole, rounds)),
     ]
 
 
@@ -66,28 +62,19 @@ def parts(
 @click.option("--rounds", default=7, show_default=True, help="of each candidate.")
 @click.option("--stretch", default=96, show_default=True, type=click.IntRange(1, 99),
               help="Training steps that are timed at a time.")
-@click.option("--room", type=click.Path(exists=True, file_okay=False, path_type=Path),
-              help="Data set with poses, or workspace with cameras.  [default: none]")
-@click.option("--steps", default="1000,2000,4000,8000,30000", metavar="N,...", show_default=True,
-              help="Lengths of the runs in the room.")
-@click.option("--room-size", type=int, help="Longest side there.  [default: that of recon train]")
-@click.option("--reach", type=float, help="PSNR there that one of the runs must have, the shortest "
-              "first.  [default: within .1 dB of the longest]")
 @click.option("--only", multiple=True, type=click.Choice(
-    ["kernels", "checks", "pictures", "gsplat", "steps", "floor", "room"]),
+    ["kernels", "checks", "pictures", "gsplat", "steps"]),
     help="Part to do; may be repeated.  [default: all]")
 @click.option("--minutes", default=9.0, show_default=True, help="What does not fit is left out.")
 @click.option("--cache", type=click.Path(file_okay=False, path_type=Path),
               help="Folder of compiled kernels.  [default: a new one: compilation is timed]")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path),
               help="Write all figures as JSON.  [default: nowhere]")
-def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room: Path | None,
-         steps: str, room_size: int | None, reach: float | None, only: tuple[str, ...],
-         minutes: float, cache: Path | None, out: Path | None) -> None:
+def main(device: str, gaussians: int, size: str, rounds: int, stretch: int,
+         only: tuple[str, ...], minutes: float, cache: Path | None, out: Path | None) -> None:
     """Check and measure the triton backend on DEVICE."""
     width, _, height = size.partition("x")
-    whole, lengths = SceneSize(gaussians, int(width), int(height)), [
-        int(word) for word in steps.split(",")]
+    whole = SceneSize(gaussians, int(width), int(height))
     figures = Figures(device, 60 * minutes)
     if device == "cuda":
         found = torch.cuda.get_device_properties(0)
@@ -101,9 +88,6 @@ def main(device: str, gaussians: int, size: str, rounds: int, stretch: int, room
         for group, name, work in parts(figures, whole, rounds, stretch):
             if not only or group in only:
                 figures.part(name, lambda work=work: (clear(device), work()))
-        if room is not None and (not only or "room" in only):
-            figures.part("room", lambda: gpu_room.run(
-                figures, room, lengths, room_size, reach))
     clock.cancel()
     click.echo(f"\n{figures.table()}")
     if out is not None:

@@ -12,13 +12,12 @@ from pathlib import Path
 import click
 import numpy as np
 from scipy.spatial.transform import Rotation
+from workbench import open_trained, workspaces_argument
 
 from recon_cli.context import StageContext
 from recon_cli.export.import_alignment import SOURCE, align_to_views
-from recon_cli.io.training_scene import load_scene
 from recon_cli.render.registry import resolve
 from recon_cli.scene.similarity import Similarity
-from recon_cli.splats.ply import read_ply
 
 MOVES = [  # degrees, extents, scale
     (0, 0, 1), (1, 0, 1), (3, 0, 1), (10, 0, 1), (45, 0, 1), (0, 0.05, 1), (0, 0.2, 1),
@@ -26,15 +25,13 @@ MOVES = [  # degrees, extents, scale
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True, type=click.Path(path_type=Path))
+@workspaces_argument
 def main(workspaces: tuple[Path, ...]) -> None:
     """Prints a line for each workspace and move."""
     backend, device = resolve("auto", "cpu")
     ctx = StageContext(backend=backend, device=device)
     for root in workspaces:
-        scene = load_scene(
-            {name: root / name for name in ("ingest", "sfm")}, validation=0.05)
-        splats = read_ply(root / "train" / "splats.ply")
+        _, scene, splats = open_trained(root)
         middle = scene.points.mean(axis=0)
         for degrees, extents, scale in MOVES:
             turn = Rotation.from_rotvec([0, 0, np.radians(degrees)]).as_matrix()

@@ -24,6 +24,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from workbench import FOLDER
 
 from recon_cli.sfm.join_segments import MODEL_FOLDER
 from recon_cli.sfm.segment_joins import (
@@ -76,8 +77,7 @@ def break_segment(
 
 
 @click.command()
-@click.argument("folders", nargs=-1, required=True,
-                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("folders", nargs=-1, required=True, type=FOLDER)
 def main(folders: Sequence[Path]) -> None:
     """Print a row for each kind of break."""
     rows: dict[str, list[tuple[float, ...]]] = defaultdict(list)

@@ -17,14 +17,13 @@ from pathlib import Path
 import click
 import cv2
 import torch
+from workbench import open_trained, print_head, print_row, workspace_argument
 
 from recon_cli.io.images import fit_camera
-from recon_cli.io.training_scene import load_scene
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.lod import make_levels, write_lod
-from recon_cli.splats.ply import read_ply
 
 SIZES = (1, 2, 4, 8)
 VIEWS, SIDE = 8, 600
@@ -49,12 +48,10 @@ def agreement(splats: Splats, views: Sequence[tuple[Camera, torch.Tensor]], size
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspace_argument
 def main(workspace: Path) -> None:
     """Print Gaussians, megabytes and agreement of each level."""
-    splats = read_ply(workspace / "train" / "splats.ply")
-    scene = load_scene(
-        {name: workspace / name for name in ("ingest", "sfm")}, validation=0.0)
+    _, scene, splats = open_trained(workspace)
     cameras = [fit_camera(view.camera, SIDE)
                for view in scene.train[:: max(1, len(scene.train) // VIEWS)]]
     views = [(camera, image(splats, camera)) for camera in cameras]
@@ -68,11 +65,10 @@ def main(workspace: Path) -> None:
         sizes = [sum(file.stat().st_size for part in Path(folder).glob(f"{level}_*")
                      for file in part.iterdir()) for level in range(len(levels))]
     click.echo(f"levels in {making:.1f} s, files in {writing:.1f} s")
-    click.echo("| level | Gaussians | MB |" + "".join(f" dB at 1/{size} |" for size in SIZES))
-    click.echo("|---|---:|---:|" + "---:|" * len(SIZES))
+    print_head("level", "Gaussians", "MB", *(f"dB at 1/{size}" for size in SIZES))
     for level, coarse in enumerate(levels):
-        click.echo(f"| {level} | {len(coarse):,} | {sizes[level] / 1e6:.1f} |" + "".join(
-            f" {agreement(coarse, views, size):.1f} |" for size in SIZES))
+        print_row(str(level), f"{len(coarse):,}", f"{sizes[level] / 1e6:.1f}", *(
+            f"{agreement(coarse, views, size):.1f}" for size in SIZES))
 
 
 if __name__ == "__main__":

@@ -17,12 +17,18 @@ from unittest.mock import patch
 
 import click
 import cv2
+from workbench import (
+    numba_context,
+    open_scene,
+    print_head,
+    print_row,
+    stage_folders,
+    workspace_argument,
+)
 
 from recon_cli import machine
 from recon_cli.config.stages import TrainConfig
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.io.training_scene import load_scene
-from recon_cli.render.registry import use_threads
+from recon_cli.context import StageInputs
 from recon_cli.scene.scene import Scene
 from recon_cli.stages import train
 
@@ -43,7 +49,7 @@ def enlarged(scene: Scene, count: int, width: int, folder: Path) -> Scene:
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspace_argument
 @click.option("--views", default=1200, show_default=True)
 @click.option("--width", default=1280, show_default=True)
 @click.option("--iterations", default=300, show_default=True)
@@ -56,7 +62,7 @@ def main(
 ) -> None:
     """Print peak memory and seconds with images in memory and in a file."""
     if child is None:
-        click.echo("| images | peak memory, GB | seconds |\n|---|---:|---:|")
+        print_head("images", "peak memory, GB", "seconds")
         with tempfile.TemporaryDirectory(dir=workspace.parent) as folder:
             for given in (1e6, max_memory):
                 subprocess.run(
@@ -65,18 +71,16 @@ def main(
                      str(max_gaussians), "--max-memory", str(given), "--child", folder],
                     check=True)
         return
-    use_threads("numba", 2)
-    inputs = StageInputs({name: workspace / name for name in ("ingest", "denoise", "sfm")})
-    scene = enlarged(load_scene(inputs.folders, validation=0.05), views, width, child)
+    scene = enlarged(open_scene(workspace, 0.05), views, width, child)
     config = TrainConfig(
         iterations=iterations, max_size=width, max_gaussians=max_gaussians)
-    ctx = StageContext(backend="numba", threads=2, max_memory_bytes=int(max_memory * 1e9),
-                       scratch=child)
+    ctx = dataclasses.replace(
+        numba_context(2), max_memory_bytes=int(max_memory * 1e9), scratch=child)
     with (tempfile.TemporaryDirectory(dir=child) as out, machine.Meter() as meter,
           patch.object(train, "load_scene", lambda *_, **__: scene)):
-        train.run(config, inputs, Path(out), ctx)
+        train.run(config, StageInputs(stage_folders(workspace)), Path(out), ctx)
     label = "in memory" if max_memory >= 1e6 else f"in a file, --max-memory {max_memory:g}"
-    click.echo(f"| {label} | {meter.peak_memory_bytes / 1e9:.2f} | {meter.seconds:.0f} |")
+    print_row(label, f"{meter.peak_memory_bytes / 1e9:.2f}", f"{meter.seconds:.0f}")
 
 
 if __name__ == "__main__":

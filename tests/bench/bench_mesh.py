@@ -24,19 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pose_errors import similarity
 from scipy.spatial import cKDTree
+from workbench import numba_context, open_trained, print_head, print_row, workspace_argument
 
-from recon_cli.context import StageContext
-from recon_cli.io.training_scene import load_scene
 from recon_cli.io.views import load_views
-from recon_cli.progress import NullProgress
-from recon_cli.render.registry import use_threads
 from recon_cli.room import mesh as build
 from recon_cli.room.depth_maps import DepthMaps, render_depth_maps, weigh, weigh_by_agreement
 from recon_cli.room.volume import extract, fuse, pixel_rays
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
-from recon_cli.splats.ply import read_ply
 
 ROOMS = Path(__file__).resolve().parents[3] / "shared" / "data" / "rooms"
 SPACING, DENSE = 0.03, 0.01  # metres
@@ -150,23 +146,19 @@ def copy(maps: DepthMaps) -> DepthMaps:
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(path_type=Path, exists=True))
+@workspace_argument
 @click.argument("room")
 @click.option("--threads", default=2, show_default=True)
 @click.option("--triangles", default=300_000, show_default=True)
 @click.option("--video", is_flag=True, help="The workspace was made from the video of ROOM.")
 def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) -> None:
     """Prints the table."""
-    use_threads("numba", threads)
-    folders = {name: workspace / name for name in ("ingest", "sfm", "train")}
-    scene = load_scene(folders, validation=0.05)
-    splats = read_ply(workspace / "train" / "splats.ply")
-    ctx = StageContext(NullProgress(), "cpu", "numba", threads)
+    _, scene, splats = open_trained(workspace)
+    ctx = numba_context(threads)
     true, moved = true_scene(scene, ROOMS / room) if video else (scene, lambda places: places)
     points, dense = reference(ROOMS / room, true.train[0].camera)
     shown = shown_by([view.camera for view in true.train], points, dense)
-    click.echo("| depth | F (precision, recall) at 5 cm | at 2 cm | triangles | s | CPU s | MB |")
-    click.echo("|---|---|---|---:|---:|---:|---:|")
+    print_head("depth", "F (precision, recall) at 5 cm", "at 2 cm", "triangles", "s", "CPU s", "MB")
 
     def row(
         name: str, make: Callable[[], tuple[NDArray[np.float64], NDArray[np.int64]]],
@@ -177,8 +169,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         scores = f_scores(moved(vertices), faces, points, shown)
-        click.echo(f"| {name} | {scores} | {len(faces):,} | {seconds:.1f} | {cpu:.1f} | "
-                   f"{peak:.0f} |")
+        print_row(name, scores, f"{len(faces):,}", f"{seconds:.1f}", f"{cpu:.1f}", f"{peak:.0f}")
 
     views = load_views(scene.train, SIZE, "not used")
     maps = render_depth_maps(splats, views, "numba")

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -24,19 +23,23 @@ from unittest.mock import patch
 
 import click
 import numpy as np
+from workbench import (
+    numba_context,
+    open_scene,
+    print_head,
+    print_row,
+    train_model,
+    workspaces_argument,
+)
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.context import StageContext, StageInputs
+from recon_cli.context import StageContext
 from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.runner import score_as_ply
 from recon_cli.io.colmap import read_visibility
-from recon_cli.io.training_scene import load_scene
-from recon_cli.render.registry import use_threads
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state
-from recon_cli.train.plan import Facts, count_detail, first_count, useful_cap
+from recon_cli.train.plan import Facts, count_detail, useful_cap
 from recon_cli.train.schedule import RECIPES, Recipe, Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.stereo_points import SparseModel, StereoPoints
@@ -81,17 +84,14 @@ def planned(task: Task, changes: dict[str, Any], seed: int) -> Task:
 
 def trained(task: Task, scene: Scene) -> TrainState:
     """Returns the state at the end of a run."""
-    config = task.schedule.config
-    with patch.dict(RECIPES, {config.densify: task.schedule.recipe}):  # the optimizer looks there
-        state = first_state(
-            task, scene.points, scene.colors, most=first_count(config, len(scene.points)))
-        fit(state, task, config.iterations)
-    return state
+    schedule = task.schedule  # the optimizer looks for its recipe in RECIPES
+    with patch.dict(RECIPES, {schedule.config.densify: schedule.recipe}):
+        return train_model(task, scene)
 
 
 def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: range,
-        ctx: StageContext) -> str:
-    """Returns the means over seeds as a line of a table."""
+        ctx: StageContext) -> tuple[str, ...]:
+    """Returns the means over seeds as cells of a table."""
     size = task.schedule.config.max_size
     scored = load_reference_views(scene.validation or scene.test, size, ctx)
     shown = task.train[::max(1, -(-len(task.train) // SHOWN))]
@@ -108,8 +108,8 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
     middle = [statistics.mean(column) for column in zip(*found, strict=True)]
     spread = f"{statistics.stdev(f[0] for f in found):.2f}" if len(found) > 1 else ""
     words = ",".join(f"{key}={value}" for key, value in changes.items()) or "nothing"
-    return (f"| {name} | {words} | {middle[0]:.2f} / {middle[1]:.4f} | {spread} | {middle[2]:.2f} "
-            f"| {middle[4]:,.0f} | {middle[3]:.0f} |")
+    return (name, words, f"{middle[0]:.2f} / {middle[1]:.4f}", spread, f"{middle[2]:.2f}",
+            f"{middle[4]:,.0f}", f"{middle[3]:.0f}")
 
 
 def without_stretches(scene: Scene) -> tuple[Scene, SparseModel]:
@@ -133,8 +133,7 @@ def without_stretches(scene: Scene) -> tuple[Scene, SparseModel]:
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True,
-                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspaces_argument
 @click.option("--set", "common", multiple=True, help="NAME=VALUE,...: options of all rows.")
 @click.option("--change", "changed", multiple=True, help="NAME=VALUE,...: of one row.")
 @click.option("--seeds", default="1", show_default=True, help="N for 0 to N - 1, or A-B.")
@@ -148,8 +147,7 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
          seeds: str, iterations: int, max_size: int, max_gaussians: int, threads: int,
          validation: float, stretches: bool) -> None:
     """Print held-out and training PSNR of each change."""
-    use_threads("numba", threads)
-    ctx = StageContext(backend="numba")
+    ctx = numba_context(threads)
     first, _, last = seeds.partition("-")
     chosen = range(int(first), int(last) + 1) if last else range(int(first))
     base = RunConfig(
@@ -158,11 +156,10 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
         images="original", far="on", exposure="off",
         early_stop=False)
     shared = {name: value for text in common for name, value in parsed(text).items()}
-    click.echo("| scene | change | PSNR / SSIM | deviation | training views | Gaussians | CPU s |\n"
-               "|---|---|---:|---:|---:|---:|---:|")
+    print_head(
+        "scene", "change", "PSNR / SSIM", "deviation", "training views", "Gaussians", "CPU s")
     for workspace in workspaces:
-        inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
-        scene = load_scene(inputs.folders, validation=base.validation)
+        scene = open_scene(workspace, base.validation)
         if stretches:
             scene, sparse = without_stretches(scene)
         task = load_task(scene, base, ctx)
@@ -174,8 +171,7 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
             task = planned(task, {"max_gaussians": useful_cap(facts, iterations)}, 0)
         trained(planned(task, {"iterations": WARM}, 0), scene)
         for changes in ({}, *map(parsed, changed)):
-            click.echo(row(workspace.name, task, scene, {**shared, **changes}, chosen, ctx))
-            sys.stdout.flush()
+            print_row(*row(workspace.name, task, scene, {**shared, **changes}, chosen, ctx))
 
 
 if __name__ == "__main__":

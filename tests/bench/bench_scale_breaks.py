@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from pose_errors import similarity
 from verdict_captures import CAPTURES, MODEL, Capture, prepare
 from verdict_variants import ordered_poses
+from workbench import FOLDER, print_head, print_row
 
 from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
@@ -79,12 +80,11 @@ class Row:
         refused = self.otherwise or self.error > bound
         return {"good": refused, "broken": not refused}.get(self.label, False)
 
-    def line(self) -> str:
-        """Its line of the table."""
-        cells = (self.capture, self.made, self.cameras, f"{self.left:.3f}", f"{self.error:.3f}",
+    def cells(self) -> tuple[str, ...]:
+        """Its cells of the table."""
+        return (self.capture, self.made, self.cameras, f"{self.left:.3f}", f"{self.error:.3f}",
                  str(self.loops), self.label or "-", "trusted" if self.trusted else "refused",
                  "WRONG" if self.is_wrong(MAX_ERROR) else "")
-        return f"| {' | '.join(cells)} |"
 
 
 def relative_scale(before: Array, after: Array, place: int) -> float:
@@ -236,7 +236,7 @@ def held_out(rows: Sequence[Row]) -> Iterator[str]:
 
 
 @click.command()
-@click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("data", type=FOLDER)
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
 @click.argument("names", nargs=-1)
 @click.option("--walk", nargs=3, multiple=True, type=click.Path(exists=True, path_type=Path))
@@ -244,16 +244,16 @@ def main(data: Path, out: Path, names: tuple[str, ...], walk: tuple[tuple[Path, 
     """Prints the table, and what bounds from some captures decide on others."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     pycolmap.logging.minloglevel = 2
-    click.echo(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
+    print_head(*HEADS)
     rows = []
     for paths in walk:
         rows.append(walk_row(*paths))
-        click.echo(rows[-1].line())
+        print_row(*rows[-1].cells())
     for capture in CAPTURES:
         if capture.name in (names or DEFAULT):
             for row in read_or_make(capture, data, out):
                 rows.append(row)
-                click.echo(row.line())
+                print_row(*row.cells())
     for label in ("good", "broken"):
         own = [row for row in rows if row.label == label]
         wrong = sum(row.is_wrong(MAX_ERROR) for row in own)

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import json
 import math
-import resource
-import subprocess
-import sys
-import time
+from dataclasses import astuple
 from pathlib import Path
 
 import click
 import cv2
 import numpy as np
 from pose_errors import compare, model_poses, reference_poses
+from workbench import FOLDER, print_head, print_row, read_json, run_recon
 
 from recon_cli.flythrough.output import VideoEncoding, encode_video
 
@@ -27,19 +25,6 @@ HEADINGS = (
     "frames", "registered", "segments", "centre RMSE", "largest", "rotation", "sfm CPU s", "wall s",
     "CPU s a frame", "exponent", "MB", "parts: CPU s", "ended with")
 FPS = 10.0
-
-
-def ran(workspace: Path, verb: str, *arguments: str) -> tuple[int, str, float, float]:
-    """Runs a verb; returns its exit code, first error line, and CPU and wall seconds."""
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    done = subprocess.run(
-        [sys.executable, "-m", "recon_cli", verb, *arguments, "-w", str(workspace)],
-        stderr=subprocess.PIPE, text=True)
-    click.echo(done.stderr, err=True, nl=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]
-    return done.returncode, errors[0] if errors else "", cpu, time.monotonic() - start
 
 
 def prepare(apartment: Path, count: int, workspace: Path) -> None:
@@ -54,10 +39,11 @@ def prepare(apartment: Path, count: int, workspace: Path) -> None:
     # every frame of it: the walk has no blurred ones
     for verb, options in (("ingest", (str(video), "--frames", str(count), "--sharpness", "0")),
                           ("denoise", ("--off",))):
-        code, error, cpu, wall = ran(workspace, verb, *options)
-        if code:
-            raise click.ClickException(error)
-        click.echo(f"{verb} of {count} frames: {cpu:.0f} s of CPU, {wall:.0f} s", err=True)
+        done = run_recon(workspace, verb, *options)
+        if done.code:
+            raise click.ClickException(done.error)
+        click.echo(f"{verb} of {count} frames: {done.cpu_seconds:.0f} s of CPU, "
+                   f"{done.seconds:.0f} s", err=True)
 
 
 def row(apartment: Path, count: int, workspace: Path, options: tuple[str, ...]) -> dict[str, str]:
@@ -66,14 +52,14 @@ def row(apartment: Path, count: int, workspace: Path, options: tuple[str, ...]) 
     if not (workspace / "ingest" / "manifest.json").exists():
         prepare(apartment, count, workspace)
     if not measured.exists():
-        code, error, cpu, wall = ran(workspace, "sfm", *options)
-        measured.write_text(json.dumps([code, error, cpu, wall]), encoding="utf-8")
-    code, error, cpu, wall = json.loads(measured.read_text(encoding="utf-8"))
+        done = astuple(run_recon(workspace, "sfm", *options))
+        measured.write_text(json.dumps(done), encoding="utf-8")
+    code, error, cpu, wall = read_json(measured)
     cells = {"frames": str(count), "sfm CPU s": f"{cpu:.0f}", "wall s": f"{wall:.0f}",
              "CPU s a frame": f"{cpu / count:.2f}", "cpu": str(cpu)}
     if code:
         return {**cells, "ended with": f"exit {code}: {error}"}
-    manifest = json.loads((workspace / "sfm" / "manifest.json").read_text(encoding="utf-8"))
+    manifest = read_json(workspace / "sfm" / "manifest.json")
     summary = manifest["summary"]
     errors = compare(model_poses(workspace / "sfm" / "sparse"),
                      reference_poses(apartment / "traj.txt"))
@@ -94,13 +80,13 @@ def row(apartment: Path, count: int, workspace: Path, options: tuple[str, ...]) 
 
 
 @click.command()
-@click.argument("apartment", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("apartment", type=FOLDER)
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
 @click.argument("counts", nargs=-1, type=int)
 @click.option("--sfm", "options", multiple=True, help="An option of sfm, word by word.")
 def main(apartment: Path, out: Path, counts: tuple[int, ...], options: tuple[str, ...]) -> None:
     """Prints a Markdown table, a row as soon as it is known."""
-    click.echo(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}")
+    print_head(*HEADINGS)
     before: tuple[int, float] | None = None
     for count in counts or (300, 600, 1200):
         workspace = out.resolve() / str(count)
@@ -110,7 +96,7 @@ def main(apartment: Path, out: Path, counts: tuple[int, ...], options: tuple[str
         if before is not None:
             cells["exponent"] = f"{math.log(cpu / before[1]) / math.log(count / before[0]):.2f}"
         before = count, cpu
-        click.echo(f"| {' | '.join(cells.get(name, '') for name in HEADINGS)} |")
+        print_row(*(cells.get(name, "") for name in HEADINGS))
 
 
 if __name__ == "__main__":

@@ -15,13 +15,13 @@ be mapped one at a time.
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
 import numpy as np
 from scipy.optimize import lsq_linear
+from workbench import print_head, print_row, read_json, workspaces_argument
 
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.io.tracks import TRACKS, Tracks
@@ -61,7 +61,7 @@ def told(work: Workload, costs: Costs = COSTS) -> float:
 def read_row(workspace: Path) -> Row | None:
     """Returns the row of a workspace; None without an sfm that was mapped here and timed."""
     try:
-        manifest = json.loads((workspace / "sfm" / "manifest.json").read_text(encoding="utf-8"))
+        manifest = read_json(workspace / "sfm" / "manifest.json")
         frames = read_frame_list(workspace / "ingest")
         summary = SfmSummary.from_json(manifest["summary"])
     except (OSError, FormatError, ManifestError):  # unfinished, or of another version
@@ -92,23 +92,21 @@ def fit(rows: list[Row]) -> Costs:
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True,
-                type=click.Path(exists=True, path_type=Path))
+@workspaces_argument
 @click.option("--fit", "fitting", is_flag=True, help="Print costs that fit.")
 def main(workspaces: tuple[Path, ...], fitting: bool) -> None:
     """Prints the table."""
     rows = [row for row in map(read_row, workspaces) if row is not None]
     if not rows:
         raise click.ClickException("none of these workspaces holds a mapped sfm with its times")
-    click.echo("| " + " | ".join(HEADINGS) + " |")
-    click.echo("|---|---:|---:|---:|---|---:|---:|---:|---:|---:|---:|---|")
+    print_head(*HEADINGS)
     for row in rows:
         work = row.work
-        click.echo("| " + " | ".join((
+        print_row(
             row.name, str(work.frames), str(work.keyframes or ""), f"{work.megapixels:.2f}",
             "walk" if work.tracked else "photos", str(work.segments), f"{told(work):.0f}",
             f"{row.cpu_seconds:.0f}", f"{row.ratio:.2f}", f"{expected_seconds(work, 2):.0f}",
-            f"{row.seconds:.0f}", ", ".join(row.later))) + " |")
+            f"{row.seconds:.0f}", ", ".join(row.later))
     first = [row for row in rows if not row.later]
     right = sum(abs(row.ratio - 1) <= TOLERANCE for row in first)
     click.echo(f"\n{right} of {len(first)} that the first mapper served are told within a third.")

@@ -13,10 +13,10 @@ from pathlib import Path
 import click
 import numpy as np
 from numpy.typing import NDArray
+from workbench import mapping_job, workspace_argument
 
 from recon_cli.sfm import known_poses
-from recon_cli.sfm.job import CameraGroup, MappingJob
-from recon_cli.workspace.records import FOLDER, POSES, read_frame_list, read_poses
+from recon_cli.workspace.records import POSES, read_poses
 
 Poses = dict[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 
@@ -39,21 +39,14 @@ def spoilt(viewmats: Poses) -> dict[str, Poses]:
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(exists=True, path_type=Path))
+@workspace_argument
 def main(workspace: Path) -> None:
     """Prints a line for each way."""
     ingest = workspace / "ingest"
-    frames = read_frame_list(ingest)
-    groups = tuple(
-        CameraGroup(tuple(frame.name for frame in frames.frames if frame.group == index),
-                    group.width, group.height, group.focal_px, group.lens)
-        for index, group in enumerate(frames.groups))
     with tempfile.TemporaryDirectory() as out:
-        job = MappingJob(
-            frames=ingest / FOLDER, denoised=ingest / FOLDER, out=Path(out), groups=groups,
-            masks=None, poses=ingest / POSES, pose_use="keep", given_points=True, pairs="auto",
-            max_features=3000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
-            scale_between=None, max_minutes=5.0, seed=0, threads=2, sharpness={}, times={})
+        job = mapping_job(
+            ingest, Path(out), poses=ingest / POSES, pose_use="keep", given_points=True,
+            partial=True, gravity=True, max_minutes=5.0, threads=2)
         for label, viewmats in spoilt(dict(read_poses(ingest / POSES).viewmats)).items():
             check = known_poses.spot_check(job, viewmats)
             share = "too few to tell" if check.share is None else f"{check.share:.3f}"

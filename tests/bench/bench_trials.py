@@ -21,19 +21,23 @@ from pathlib import Path
 import click
 import numpy as np
 from numpy.typing import NDArray
+from workbench import (
+    numba_context,
+    open_scene,
+    print_head,
+    print_row,
+    train_model,
+    workspaces_argument,
+)
 
 from recon_cli.config.stages import RunConfig, TrainConfig
-from recon_cli.context import StageContext, StageInputs
+from recon_cli.context import StageContext
 from recon_cli.evaluation.metrics import corrected_psnr, psnr
 from recon_cli.evaluation.reference_views import render_view
-from recon_cli.io.training_scene import load_scene
-from recon_cli.render.registry import use_threads
 from recon_cli.scene.scene import Scene
 from recon_cli.train.exposure import estimate_gains
 from recon_cli.train.feature_trials import PARTS
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state
-from recon_cli.train.plan import Facts, cap, choose_parts, count_detail, first_config, first_count
+from recon_cli.train.plan import Facts, cap, choose_parts, count_detail, first_config
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task, load_views
@@ -53,8 +57,7 @@ class Capture:
         self, workspace: Path, asked: TrainConfig, ctx: StageContext, seeds: int
     ) -> None:
         self.name, self.asked, self.ctx = workspace.name, asked, ctx
-        inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
-        self.scene: Scene = load_scene(inputs.folders, validation=VALIDATION)
+        self.scene: Scene = open_scene(workspace, VALIDATION)
         self.task: Task = load_task(self.scene, first_config(asked), ctx)
         self.needs = choose_parts(self.task, self.scene, ctx, harmonics=True)
         self._scores: dict[RunConfig, NDArray[np.float64]] = {}
@@ -86,9 +89,7 @@ class Capture:
                 train = load_views(self.scene.train, config, self.ctx)
             task = dataclasses.replace(
                 self.task, train=train, validation=[], schedule=Schedule(config))
-            state = first_state(task, self.scene.points, self.scene.colors,
-                                most=first_count(config, len(self.scene.points)))
-            fit(state, task, config.iterations)
+            state = train_model(task, self.scene)
             rows = []
             for view in self.task.validation:
                 rgb = render_view(
@@ -97,8 +98,8 @@ class Capture:
             self._scores[config] = np.array(rows)
         return self._scores[config]
 
-    def row(self, part: str, iterations: int) -> str | None:
-        """Returns the line of one part at one length; None where there is no choice."""
+    def row(self, part: str, iterations: int) -> tuple[str, ...] | None:
+        """Returns the cells of one part at one length; None where there is no choice."""
         config = self.config(iterations)
         other = self.changed(config, part)
         if other is None:
@@ -123,9 +124,9 @@ class Capture:
             tried += f" ({local:.2f})"
         choice = str(config.sh_degree) if part == DEGREE else ("on" if on else "off")
         lost = max(0.0, -mean if on else mean)
-        return (f"| {self.name} | {part} | {tried} | {choice} | {iterations:,} "
-                f"| {chosen[..., 1].mean():.2f} | {as_is:+.2f} | {corrected:+.2f} "
-                f"| {mean:+.2f} ± {error:.2f} | {lost:.2f} | {seconds:.0f} |")
+        return (self.name, part, tried, choice, f"{iterations:,}", f"{chosen[..., 1].mean():.2f}",
+                f"{as_is:+.2f}", f"{corrected:+.2f}", f"{mean:+.2f} ± {error:.2f}", f"{lost:.2f}",
+                f"{seconds:.0f}")
 
 
 def standard_error(gains: NDArray[np.float64]) -> float:
@@ -137,8 +138,7 @@ def standard_error(gains: NDArray[np.float64]) -> float:
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True,
-                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspaces_argument
 @click.option("--iterations", "lengths", multiple=True, type=int, default=(3000, 10_000),
               show_default=True)
 @click.option("--part", "parts", multiple=True, type=click.Choice(ALL), default=ALL,
@@ -149,11 +149,9 @@ def standard_error(gains: NDArray[np.float64]) -> float:
 def main(workspaces: tuple[Path, ...], lengths: tuple[int, ...], parts: tuple[str, ...],
          max_size: int, threads: int, seeds: int) -> None:
     """Print what each part is worth in the trial and in runs of full length, in dB."""
-    use_threads("numba", threads)
-    ctx = StageContext(backend="numba")
-    click.echo("| capture | part | trial | chosen | steps | PSNR | gain as it is | after gain "
-               "| counted | lost | CPU s |\n"
-               "|---|---|---:|---|---:|---:|---:|---:|---:|---:|---:|")
+    ctx = numba_context(threads)
+    print_head("capture", "part", "trial", "chosen", "steps", "PSNR", "gain as it is",
+               "after gain", "counted", "lost", "CPU s")
     for workspace in workspaces:
         capture = Capture(workspace, TrainConfig(
             max_size=max_size, validation=VALIDATION), ctx, seeds)
@@ -161,7 +159,7 @@ def main(workspaces: tuple[Path, ...], lengths: tuple[int, ...], parts: tuple[st
             for part in parts:
                 line = capture.row(part, iterations)
                 if line is not None:
-                    click.echo(line)
+                    print_row(*line)
 
 
 if __name__ == "__main__":

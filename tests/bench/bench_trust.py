@@ -19,16 +19,13 @@ from time import process_time
 import click
 import cv2
 import numpy as np
+from workbench import numba_context, open_trained, print_head, print_row, workspaces_argument
 
-from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.reference_views import load_reference_views
-from recon_cli.io.training_scene import load_scene
 from recon_cli.io.views import ReferenceView
 from recon_cli.machine import usable_threads
 from recon_cli.scene.splats import Splats
-from recon_cli.splats.ply import read_ply
 from recon_cli.train.runner import LOG, seconds_at
-from recon_cli.train.train_data import read_config
 from recon_cli.trust.agreement import ause
 from recon_cli.trust.error_model import picture_terms
 from recon_cli.trust.scene_trust import Trust, measure_trust, model_trust
@@ -51,19 +48,15 @@ def bounds(splats: Splats, trust: Trust, views: Sequence[ReferenceView]) -> tupl
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True,
-                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspaces_argument
 def main(workspaces: Sequence[Path]) -> None:
     """Print AUSE, reliability, the surface's shares and the cost of each workspace."""
     plots = []
-    click.echo("| workspace | views | AUSE | opacity | depth | 5x5 means | random | gap of bins | "
-               f"well seen | few | CPU s | of training |\n|---|{'---:|' * 11}")
+    print_head("workspace", "views", "AUSE", "opacity", "depth", "5x5 means", "random",
+               "gap of bins", "well seen", "few", "CPU s", "of training")
     for workspace in workspaces:
-        inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm", "train")})
-        config = read_config(workspace / "train")
-        scene = load_scene(inputs.folders, validation=config.validation)
-        splats = read_ply(workspace / "train" / "splats.ply")
-        ctx = StageContext(backend="numba", threads=usable_threads())
+        config, scene, splats = open_trained(workspace)
+        ctx = numba_context(usable_threads())
         start = process_time()
         trust = measure_trust(splats, scene, config, config.max_size, ctx)
         took = process_time() - start
@@ -74,11 +67,11 @@ def main(workspaces: Sequence[Path]) -> None:
         agreement, (low, high) = row.agreement, bounds(splats, trust, views)
         assert agreement is not None
         trained = seconds_at(workspace / "train" / LOG, 1 << 62, clock="cpu_seconds")
-        click.echo(
-            f"| {workspace.name} | {agreement.views} | {agreement.ause:.3f} | "
-            f"{agreement.ause_opacity:.3f} | {agreement.ause_depth:.3f} | {low:.3f} | {high:.3f} | "
-            f"{agreement.gap:.0%} | {row.surface.well:.0%} | {row.surface.few:.0%} | {took:.1f} | "
-            f"{took / max(trained, 1e-9):.1%} |")
+        areas = (agreement.ause, agreement.ause_opacity, agreement.ause_depth, low, high)
+        print_row(
+            workspace.name, str(agreement.views), *(f"{area:.3f}" for area in areas),
+            f"{agreement.gap:.0%}", f"{row.surface.well:.0%}", f"{row.surface.few:.0%}",
+            f"{took:.1f}", f"{took / max(trained, 1e-9):.1%}")
         plots.append(f"\n{workspace.name}: bias {trust.error.bias:.2f}, weights "
                      f"{ {k: round(v, 2) for k, v in trust.error.weights.items()} }\n" + "\n".join(
             f"  expected {expected:.4f} real {real:.4f} ratio {expected / real:.2f}"

@@ -26,9 +26,10 @@ import click
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from pose_errors import reference_poses, similarity
+from pose_errors import reference_poses, similarity, trident_poses
 from verdict_captures import CAPTURES, MODEL, ROOMS, Capture, prepare, quiet
 from verdict_variants import BROKEN, GOOD, Variant, make, ordered_poses
+from workbench import FOLDER
 
 from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
@@ -105,7 +106,7 @@ def reference(capture: Capture, data: Path) -> Centers:
     if capture.name == "fox":
         return _places(reference_poses(data / "fox"))
     if capture.name == "trident":
-        return {name: pose.inverse().translation for name, pose in trident_poses(data).items()}
+        return _places(trident_poses(data))
     if capture.name.startswith("one_poster"):
         apart: dict[str, NDArray[np.float64]] = {}
         for offset, name in enumerate(ROOMS):
@@ -118,19 +119,6 @@ def reference(capture: Capture, data: Path) -> Centers:
 
 def _places(poses: Mapping[str, NDArray[np.float64]]) -> Centers:
     return {name: pose[:3, 3] for name, pose in poses.items()}
-
-
-def trident_poses(data: Path) -> dict[str, pycolmap.Rigid3d]:
-    """World to camera by name; file k + 1 is frame k, with OpenGL's axes."""
-    frames = json.loads((data / "walks/trident_desk/transforms_train.json").read_text("utf-8"))
-    poses = {}
-    for frame in frames["frames"]:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 1:3] *= -1
-        viewmat = np.linalg.inv(pose)
-        poses[f"{int(Path(frame['file_path']).stem) - 1:06d}.png"] = pycolmap.Rigid3d(
-            pycolmap.Rotation3d(viewmat[:3, :3]), viewmat[:3, 3])
-    return poses
 
 
 def displacements(found: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -191,8 +179,9 @@ def rows_of(capture: Capture, number: int, data: Path, out: Path) -> Iterator[Ro
                 yield judge(capture, made, max(models, key=mapper.model_size), job, truth)
         return
     if capture.name == "trident":
-        known = trident_poses(data)
-        poses = {name: known[name] for name in job.names}
+        known = {name: np.linalg.inv(pose) for name, pose in trident_poses(data).items()}
+        poses = {name: pycolmap.Rigid3d(
+            pycolmap.Rotation3d(known[name][:3, :3]), known[name][:3, 3]) for name in job.names}
         yield from _made(capture, Variant("true poses", lambda _: poses), job, base, truth)
     if own.label != "good":
         return
@@ -254,7 +243,7 @@ def keep_thirds(rows: Sequence[Row]) -> Iterator[str]:
 
 
 @click.command()
-@click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("data", type=FOLDER)
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
 @click.argument("names", nargs=-1)
 @click.option("--map", "only_map", is_flag=True, help="Only map the captures.")

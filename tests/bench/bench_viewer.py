@@ -1,28 +1,17 @@
-"""How fast and how true `recon view` is: `python tests/bench/bench_viewer.py WORKSPACE`.
+"""How close `recon view` is to recon's renders: `python tests/bench/bench_viewer.py WORKSPACE`.
 
-In headless Chromium, whose WebGL is SwiftShader: in software, on the processors of this machine.
-A GPU draws the same pictures faster, never slower. Prints
-
-- the PSNR of the browser's picture against recon's own of the same camera and size, without
-  harmonics, over black, for every held-out view. The pixels come from the page's canvas by viser's
-  get_render, which leaves the panel out;
-- the seconds from the command to the first picture of the scene, for the workspace;
-- pictures a second while the camera turns, and CPU seconds a picture, for a synthetic room of
-  100,000 and of 500,000.
+Prints, for every held-out view, the PSNR of the picture in headless Chromium against recon's own of
+the same camera and size, without harmonics, over black. The pixels come from the page's canvas by
+viser's get_render, which leaves the panel out.
 
 `--picture FILE` takes a picture of the page for the documentation and nothing else.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import io
-import math
-import re
-import signal
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -31,7 +20,6 @@ from pathlib import Path
 
 import click
 import numpy as np
-import psutil
 import torch
 import viser.transforms
 from numpy.typing import NDArray
@@ -40,16 +28,15 @@ from playwright.sync_api import Browser
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from browser import launch_browser, watch_page
+from workbench import workspace_argument
 
 from recon_cli.evaluation.metrics import psnr
-from recon_cli.experiments.bench_scene import room
 from recon_cli.io.images import fit_camera, to_uint8
 from recon_cli.pipeline.execute import render_context
 from recon_cli.pipeline.plan import Job
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.viewer.content import (
-    FAR,
     HELD_OUT,
     PhotoPairs,
     ViewerContent,
@@ -57,71 +44,12 @@ from recon_cli.viewer.content import (
     load_workspace,
     move_browser,
 )
-from recon_cli.viewer.gaussians import pack_splats
 from recon_cli.viewer.server import HOST, serve_scene
 from recon_cli.workspace.layout import Workspace
 
 DRAWN = """() => Object.values(window.__viserSceneTree?.getState() ?? {}).some(
     node => node?.message.type === 'GaussianSplatsMessage')"""
-FRAMES = "() => window.__viserTestpoints?.rendererInfo.render.frame ?? 0"
-SECONDS = 20.0  # of turning
 WIDTH, HEIGHT = 1280, 720
-
-
-def started(chromium: Browser, workspace: Path) -> float:
-    """Returns the seconds from the command to two pictures after the Gaussians came."""
-    with watch_page(chromium, width=WIDTH, height=HEIGHT) as page:
-        begin = time.perf_counter()
-        process = subprocess.Popen(
-            [sys.executable, "-m", "recon_cli", "view", str(workspace)],
-            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        try:
-            assert process.stdout
-            address = re.search(r"http://\S+", process.stdout.readline())
-            assert address
-            page.page.goto(address[0])
-            page.page.wait_for_function(DRAWN)
-            count = page.page.evaluate(FRAMES)
-            page.page.wait_for_function(f"({FRAMES})() >= {count + 2}")
-            return time.perf_counter() - begin
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.wait()
-
-
-def speed(chromium: Browser, content: ViewerContent) -> tuple[float, float]:
-    """Returns pictures a second while the mouse turns the camera, and CPU seconds a picture."""
-    with (serve_scene(content, None, HOST, None) as (_, address),
-          watch_page(chromium, width=WIDTH, height=HEIGHT) as page):
-        page.page.goto(address)
-        page.page.wait_for_function(DRAWN)
-        page.page.wait_for_timeout(3000)
-        page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
-        page.page.mouse.down()
-        begin, count, spent = time.perf_counter(), page.page.evaluate(FRAMES), browser_seconds()
-        step = 0
-        while time.perf_counter() - begin < SECONDS:
-            step += 1
-            page.page.mouse.move(WIDTH / 2 + 150 * math.sin(step / 10), HEIGHT / 2)
-        pictures = page.page.evaluate(FRAMES) - count
-        return pictures / (time.perf_counter() - begin), (browser_seconds() - spent) / pictures
-
-
-def browser_seconds() -> float:
-    """Returns the CPU seconds that the browser has used, which other programs hardly change."""
-    total = 0.0
-    for process in psutil.Process().children(recursive=True):
-        with contextlib.suppress(psutil.Error):
-            used = process.cpu_times()
-            total += used.user + used.system
-    return total
-
-
-def of_room(count: int) -> ViewerContent:
-    """Returns the synthetic room of `recon bench`, looked at by its camera."""
-    splats, camera = room(count, WIDTH, HEIGHT)
-    start = browser_camera(camera, 3.0, FAR)
-    return ViewerContent({"room": pack_splats(splats)}, (), -camera.viewmat[1, :3], start, 3.0, 0)
 
 
 def truth(chromium: Browser, workspace: Path) -> Iterator[str]:
@@ -191,7 +119,7 @@ def photographed(chromium: Browser, workspace: Path, path: Path) -> None:
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspace_argument
 @click.option("--picture", type=click.Path(path_type=Path))
 def main(workspace: Path, picture: Path | None) -> None:
     """Prints the figures of a workspace."""
@@ -201,12 +129,6 @@ def main(workspace: Path, picture: Path | None) -> None:
             return
         for line in truth(chromium, workspace):
             click.echo(line)
-        starts = [started(chromium, workspace) for _ in range(3)]
-        click.echo(f"command to first picture: {statistics.median(starts):.1f} s (of 3)")
-        for count in (100_000, 500_000):
-            rate, cost = speed(chromium, of_room(count))
-            click.echo(f"{count:,} Gaussians at {WIDTH}x{HEIGHT}: {rate:.2f} pictures a second, "
-                       f"{cost:.2f} CPU seconds a picture")
 
 
 if __name__ == "__main__":

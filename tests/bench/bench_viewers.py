@@ -14,16 +14,12 @@ from pathlib import Path
 
 import click
 import torch
+from workbench import numba_context, open_trained, print_head, print_row, workspaces_argument
 
-from recon_cli.context import StageContext
 from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.runner import score_as_ply
-from recon_cli.io.training_scene import load_scene
-from recon_cli.render.registry import use_threads
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.splats.ply import read_ply
-from recon_cli.train.train_data import read_config
 
 LIMITS = (2.0, 1.4, 1.2)  # times the window
 
@@ -39,28 +35,22 @@ def within(splats: Splats, camera: Camera, limit: float) -> Splats:
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True,
-                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspaces_argument
 @click.option("--threads", default=2, show_default=True)
 def main(workspaces: tuple[Path, ...], threads: int) -> None:
     """Print the PSNR of held-out views in dB, with all Gaussians and within each limit."""
-    use_threads("numba", threads)
-    ctx = StageContext(backend="numba")
-    click.echo("| scene | Gaussians | views | all | "
-               + " | ".join(f"within {limit:g}" for limit in LIMITS) + " |\n"
-               "|---|---:|---:|---:|" + "---:|" * len(LIMITS))
+    ctx = numba_context(threads)
+    print_head(
+        "scene", "Gaussians", "views", "all", *(f"within {limit:g}" for limit in LIMITS))
     for workspace in workspaces:
-        scene = load_scene(
-            {name: workspace / name for name in ("ingest", "sfm")}, validation=0)
-        config = read_config(workspace / "train")
-        splats = read_ply(workspace / "train" / "splats.ply")
+        config, scene, splats = open_trained(workspace)
         views = load_reference_views(scene.test, config.max_size, ctx)
         scores = [statistics.mean(
             score_as_ply(splats if limit is None else within(splats, view.camera, limit),
                          [view], splats.sh_degree, ctx)[0].psnr_db for view in views)
             for limit in (None, *LIMITS)]
-        click.echo(f"| {workspace.name} | {len(splats):,} | {len(views)} | "
-                   + " | ".join(f"{value:.2f}" for value in scores) + " |")
+        print_row(workspace.name, f"{len(splats):,}", str(len(views)),
+                  *(f"{value:.2f}" for value in scores))
 
 
 if __name__ == "__main__":

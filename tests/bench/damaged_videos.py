@@ -6,7 +6,7 @@ places.txt, -1 where the room's poses do not hold, so that the cameras can be ch
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import av
@@ -127,25 +127,26 @@ def label(rgb: Image) -> Image:
     return image
 
 
-def turning(data: Path, out: Path) -> Path:
-    """A camera that turns on the spot before a far picture."""
-    picture = cv2.cvtColor(cv2.imread(str(
-        sorted((data / "desk_monitors" / "images").iterdir())[0])), cv2.COLOR_BGR2RGB)
+def turn_before(picture: Image, count: int, pace: float) -> Iterator[Image]:
+    """Yields noisy frames of a camera that turns before a picture and tilts at a pace."""
     height, width = picture.shape[:2]
     draws = np.random.default_rng(0)
     wide = np.array([[0.6 * width, 0, width / 2], [0, 0.6 * width, height / 2], [0, 0, 1]])
     narrow = np.array([[500.0, 0, 240], [0, 500.0, 180], [0, 0, 1]])
+    for step in np.linspace(0, 1, count):
+        turn = cv2.Rodrigues(np.array([
+            np.radians(5 * np.sin(pace * step)), np.radians(50 * step - 25),
+            0.02 * np.cos(13 * step)]))[0]
+        image = cv2.warpPerspective(
+            picture, narrow @ turn @ np.linalg.inv(wide), (480, 360), flags=cv2.INTER_AREA)
+        yield np.clip(image + draws.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
 
-    def frames() -> Iterable[Image]:
-        for step in np.linspace(0, 1, 100):
-            turn = cv2.Rodrigues(np.array([
-                np.radians(5 * np.sin(10 * step)), np.radians(50 * step - 25),
-                0.02 * np.cos(13 * step)]))[0]
-            image = cv2.warpPerspective(
-                picture, narrow @ turn @ np.linalg.inv(wide), (480, 360), flags=cv2.INTER_AREA)
-            yield np.clip(image + draws.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
 
-    write(out / "video.mp4", frames())
+def turning(data: Path, out: Path) -> Path:
+    """A camera that turns on the spot before a far picture."""
+    picture = cv2.cvtColor(cv2.imread(str(
+        sorted((data / "desk_monitors" / "images").iterdir())[0])), cv2.COLOR_BGR2RGB)
+    write(out / "video.mp4", turn_before(picture, 100, 10.0))
     return out / "video.mp4"
 
 

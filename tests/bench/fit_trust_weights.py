@@ -20,10 +20,10 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from workbench import numba_context, open_scene, print_head, print_row, workspaces_argument
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.context import StageContext, StageInputs
-from recon_cli.io.training_scene import load_scene
+from recon_cli.context import StageContext
 from recon_cli.machine import usable_threads
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene, View
@@ -68,8 +68,7 @@ class Capture:
 
 def open_capture(workspace: Path, max_size: int, iterations: int) -> Capture:
     """Returns the capture of a workspace without its middle third."""
-    inputs = StageInputs({name: workspace / name for name in ("ingest", "sfm")})
-    scene = load_scene(inputs.folders, validation=0.05)
+    scene = open_scene(workspace, 0.05)
     every, third = scene.train, len(scene.train) // 3
     stretch = every[third:2 * third]
     names = {view.name for view in stretch}
@@ -81,7 +80,7 @@ def open_capture(workspace: Path, max_size: int, iterations: int) -> Capture:
                 # a validation view in the stretch would show what is missing
                 validation=tuple(view for view in scene.validation
                                  if not low <= view.name <= high)),
-        tuple(stretch), config, StageContext(backend="numba", threads=usable_threads()))
+        tuple(stretch), config, numba_context(usable_threads()))
 
 
 def read_stretch(workspace: Path, max_size: int, iterations: int) -> tuple[Array, Array]:
@@ -128,24 +127,23 @@ def fit_together(captures: Sequence[tuple[Array, Array]]) -> Array:
 
 
 @click.command()
-@click.argument("workspaces", nargs=-1, required=True,
-                type=click.Path(exists=True, file_okay=False, path_type=Path))
+@workspaces_argument
 @click.option("--max-size", default=320, show_default=True, help="Longest side in pixels.")
 @click.option("--iterations", default=1000, show_default=True, help="Steps of each training.")
 def main(workspaces: Sequence[Path], max_size: int, iterations: int) -> None:
     """Print the weights of each capture and of all together."""
-    click.echo(f"| capture | {' | '.join(TERMS)} |\n|---|{'---:|' * len(TERMS)}")
+    print_head("capture", *TERMS)
     captures = []
     for workspace in workspaces:
         captures.append(read_stretch(workspace, max_size, iterations))
-        show(workspace.name, fit_together(captures[-1:]))
-    show("all", fit_together(captures))
-    show("PRIOR", np.array([PRIOR[name] for name in TERMS]))
+        print_weights(workspace.name, fit_together(captures[-1:]))
+    print_weights("all", fit_together(captures))
+    print_weights("PRIOR", np.array([PRIOR[name] for name in TERMS]))
 
 
-def show(name: str, weights: Array) -> None:
+def print_weights(name: str, weights: Array) -> None:
     """Prints a row of the table."""
-    click.echo(f"| {name} | {' | '.join(f'{weight:.2f}' for weight in weights)} |")
+    print_row(name, *(f"{weight:.2f}" for weight in weights))
 
 
 if __name__ == "__main__":

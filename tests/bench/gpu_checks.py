@@ -42,7 +42,7 @@ def agreement(figures: Figures, size: SceneSize) -> None:
     errors.pop("picture")
     worst = max(errors, key=lambda name: errors[name])
     what = f"{size.gaussians:,} Gaussians, {size.width}x{size.height}"
-    # not >: what is no number fails
+    # not >: NaN fails
     good = image <= _IMAGE and all(error <= _GRADIENT for error in errors.values())
     figures.check(good, f"against float64, {what}",
                   f"picture rms {image:.1e}, worst gradient {errors[worst]:.1e} ({worst})")

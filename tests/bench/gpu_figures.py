@@ -1,4 +1,4 @@
-"""What `bench_gpu.py` found: told at once, and again in one table at the end."""
+"""The figures of `bench_gpu.py`: each printed at once, and all in one table at the end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import traceback
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import click
 import torch
@@ -22,50 +21,26 @@ _GRACE = 40  # seconds after the deadline in which a part may still end by itsel
 
 
 @dataclass(frozen=True)
-class Goal:
-    """What is wanted of a figure; aim < least where less is better.
-
-    Attributes:
-        least: the worst that will do.
-        aim: what is hoped for.
-    """
-
-    least: float
-    aim: float
-
-    def verdict(self, value: float) -> str:
-        """Returns how a value stands to it."""
-        sign = 1 if self.aim > self.least else -1
-        if sign * value >= sign * self.aim:
-            return "as aimed at"
-        return "enough" if sign * value >= sign * self.least else "MISSED"
-
-
-@dataclass(frozen=True)
 class Figure:
     """One number.
 
     Attributes:
-        name: what it is of.
-        value: None where it could not be had; the note says why.
+        name: of the thing that was measured.
+        value: None where it could not be measured; the note says why.
         unit: of the value.
-        goal: what is wanted of it; None where nothing is.
-        note: how it came about.
+        note: how it was measured.
     """
 
     name: str
     value: float | None
     unit: str
-    goal: Goal | None
     note: str
 
     def row(self) -> str:
         """Returns the line of the table."""
-        wanted = "" if self.goal is None else f"{self.goal.least:g} / {self.goal.aim:g} {self.unit}"
-        verdict = "" if self.goal is None or self.value is None else self.goal.verdict(self.value)
-        return f"| {self.name} | {self.shown()} | {wanted} | {verdict} | {self.note} |"
+        return f"| {self.name} | {self.text()} | {self.note} |"
 
-    def shown(self) -> str:
+    def text(self) -> str:
         """Returns the value with its unit, to about three digits."""
         if self.value is None:
             return "-"
@@ -75,21 +50,19 @@ class Figure:
 
 @dataclass
 class Figures:
-    """Everything found so far, and how much time is left.
+    """All figures so far, and how much time is left.
 
     Attributes:
         device: "cuda" or "cpu".
-        seconds: that all may take.
-        figures: in the order of finding.
+        seconds: that all parts together may take.
+        figures: in the order of their measurement.
         failures: checks that failed and parts that broke off.
-        more: what only the JSON file holds.
     """
 
     device: str
     seconds: float
     figures: list[Figure] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
-    more: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._begin = time.monotonic()
@@ -103,25 +76,22 @@ class Figures:
         """Prints a line at once, with the seconds since the start."""
         click.echo(f"[{time.monotonic() - self._begin:5.0f} s] {text}")
 
-    def add(
-        self, name: str, value: float | None, unit: str, goal: Goal | None = None, *,
-        note: str = "",
-    ) -> None:
+    def add(self, name: str, value: float | None, unit: str, *, note: str = "") -> None:
         """Keeps a figure and prints it."""
-        self.figures.append(Figure(name, value, unit, goal, note))
-        self.say(f"{name}: {self.figures[-1].shown()}{' (' + note + ')' if note else ''}")
+        self.figures.append(Figure(name, value, unit, note))
+        self.say(f"{name}: {self.figures[-1].text()}{' (' + note + ')' if note else ''}")
 
     def check(self, good: bool, name: str, found: str) -> None:
-        """Prints what a check found, and keeps it where it failed."""
+        """Prints the result of a check, and keeps it where it failed."""
         self.say(f"{'ok' if good else 'FAILED'}: {name}: {found}")
         if not good:
             self.failures.append(f"{name}: {found}")
 
     def part(self, name: str, work: Callable[[], None]) -> None:
-        """Does a part of the work; if it breaks off, what was found before it stays."""
+        """Does a part of the work; if it breaks off, earlier figures stay."""
         if self.left <= 0:
             self.say(f"{name}: left out, the time is over")
-            self.figures.append(Figure(name, None, "", None, "left out, the time is over"))
+            self.figures.append(Figure(name, None, "", "left out, the time is over"))
             return
         self.say(f"-- {name}")
         try:
@@ -136,7 +106,7 @@ class Figures:
         name = torch.cuda.get_device_name() if self.device == "cuda" else (
             f"{machine.cpu_model()}, triton's interpreter: no figure means anything")
         lines = [f"{name}, torch {torch.__version__}", "",
-                 "| figure | measured | at least / aim | verdict | |", "|---|---:|---:|---|---|",
+                 "| figure | measured | |", "|---|---:|---|",
                  *(figure.row() for figure in self.figures), ""]
         lines += [f"FAILED: {failure}" for failure in self.failures] or ["All checks passed."]
         return "\n".join(lines)
@@ -146,7 +116,7 @@ class Figures:
         atomic.write_json(path, {
             "device": torch.cuda.get_device_name() if self.device == "cuda" else "cpu",
             "versions": machine.versions(), "figures": [asdict(one) for one in self.figures],
-            "failures": self.failures, **self.more})
+            "failures": self.failures})
 
     def watch(self, out: Path | None) -> threading.Timer:
         """Returns a running clock that prints the table and ends all when a part hangs."""

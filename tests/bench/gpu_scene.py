@@ -1,4 +1,4 @@
-"""What `bench_gpu.py` renders and trains on: the room of `recon bench`, seen from one place.
+"""The scene of `bench_gpu.py`: the room of `recon bench`, seen from one place.
 
 Steps start in the second half of a long run with the usual recipe, where images have their full
 size and colours their full degree.
@@ -77,7 +77,7 @@ def training(
 def stretch(
     state: TrainState, task: Task, start: int, steps: int
 ) -> Callable[[], None]:
-    """Returns what takes the steps after `start`, as `recon train` takes them, and waits."""
+    """Returns a function that takes the steps after `start`, as `recon train` does, and waits."""
     advance = async_trainer.choose_trainer(state, task, None, lambda now: now == start + steps)
 
     def take() -> None:
@@ -106,5 +106,5 @@ def photometric(accounts: list[StepReport], **options: Any) -> Iterator[None]:
 
 
 def without_graphs() -> triton_step.Graphs:
-    """Returns what records nothing."""
+    """Returns a recorder that records nothing."""
     return triton_step.Graphs(None)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import torch
 from gpu_clock import clear, in_turn, middle, spread
-from gpu_figures import Figures, Goal
+from gpu_figures import Figures
 from gpu_gsplat import Gsplat, installed
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
@@ -18,9 +18,6 @@ from recon_cli.train import async_trainer
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 
-TORCH, GSPLAT = Goal(15, 40), Goal(0.5, 1.2)  # times as fast
-STEP = Goal(8, 3)  # ms
-MEMORY = Goal(2, 1)  # GB
 _NEAR_GSPLAT = 5e-3  # rms; the same picture but for the greatest alpha
 _STRETCH = 96  # steps between two densifications
 _BATCH = 4
@@ -48,14 +45,14 @@ def build(figures: Figures, size: SceneSize, steps: int) -> None:
 
 
 class _Candidate:
-    """What draws a scene, and its gradients by given weights."""
+    """A renderer of a scene, and of its gradients by given weights."""
 
     def __init__(self, scene: BenchScene, leaves: list[Tensor], draw: Picture) -> None:
         self._weights, self._leaves, self._draw = scene.weights, leaves, draw
 
     @torch.no_grad()
     def forward(self) -> Tensor:
-        """Returns the picture, without what gradients would need."""
+        """Returns the picture alone, without the buffers that gradients need."""
         return self._draw()
 
     def gradients(self) -> None:
@@ -75,13 +72,13 @@ class _Ours(_Candidate):
 def pictures(figures: Figures, size: SceneSize, rounds: int) -> None:
     """Times pictures and gradients of the two backends that a GPU has."""
     scene = build_scene(size, 3, figures.device)
-    _compare(figures, {name: _Ours(scene, name) for name in ("triton", "torch")}, TORCH, rounds)
+    _compare(figures, {name: _Ours(scene, name) for name in ("triton", "torch")}, rounds)
 
 
 def gsplat(figures: Figures, size: SceneSize, rounds: int) -> None:
     """Times gsplat's kernels on the same scene, where that package is installed."""
     if figures.device == "cpu" or not installed():
-        figures.add("triton : gsplat, forward + backward", None, "x", GSPLAT,
+        figures.add("triton : gsplat, forward + backward", None, "x",
                     note="gsplat is not installed")
         return
     scene = build_scene(size, 3, figures.device)
@@ -92,12 +89,10 @@ def gsplat(figures: Figures, size: SceneSize, rounds: int) -> None:
     error = float((one - other).square().mean().sqrt())
     word = "as ours" if error <= _NEAR_GSPLAT else "NOT AS OURS: the ratio means nothing"
     figures.add("gsplat's picture, rms difference x 1000", 1000 * error, "", note=word)
-    _compare(figures, rivals, GSPLAT, rounds)
+    _compare(figures, rivals, rounds)
 
 
-def _compare(
-    figures: Figures, rivals: Mapping[str, _Candidate], goal: Goal, rounds: int
-) -> None:
+def _compare(figures: Figures, rivals: Mapping[str, _Candidate], rounds: int) -> None:
     """Times triton and another candidate in turn."""
     other = next(name for name in rivals if name != "triton")
     for what, works in (
@@ -110,8 +105,7 @@ def _compare(
         for name, found in times.items():
             figures.add(f"{what}, {name}{beside if name == 'triton' else ''}", ms[name], "ms",
                         note=spread(found))
-        figures.add(f"triton : {other}, {what}", ms[other] / ms["triton"], "x",
-                    goal if what != "forward" else None)
+        figures.add(f"triton : {other}, {what}", ms[other] / ms["triton"], "x")
 
 
 def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH) -> None:
@@ -132,7 +126,7 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH)
             works[f"{name}, without graphs"] = stretch(state, task, start, count)
     for name, found in in_turn(works, rounds, device).items():
         figures.add(f"training step {name}", middle(found) / count, "ms",
-                    None if "without" in name else STEP, note=spread(found, count))
+                    note=spread(found, count))
     if device == "cuda":
         figures.add("the host's part of a training step", _started(state, task), "ms",
                     note="to start it, with graphs; the device works at the same time")
@@ -167,9 +161,9 @@ def _allocated(device: str) -> float:
 
 def _say_memory(figures: Figures, held: float) -> None:
     if figures.device == "cpu":
-        figures.add("GPU memory of training", None, "GB", MEMORY, note="no GPU")
+        figures.add("GPU memory of training", None, "GB", note="no GPU")
         return
-    figures.add("GPU memory of training", torch.cuda.max_memory_allocated() / _GB, "GB", MEMORY,
+    figures.add("GPU memory of training", torch.cuda.max_memory_allocated() / _GB, "GB",
                 note=f"allocated at most; {held:.2f} GB are parameters, gradients and moments")
     figures.add("GPU memory reserved", torch.cuda.max_memory_reserved() / _GB, "GB",
                 note="by torch's allocator, recordings and free blocks included")

@@ -2,8 +2,7 @@
 
 LIVING and OFFICE are workspaces with trained Gaussians of two rooms in metres, with z up and a
 corner of the floor at the origin. The third room is the first one mirrored, in other colours. They
-open on a corridor: straight, or with --ring around the first room, so that a walk comes back to
-where it began.
+open on a straight corridor.
 
 Written are a video, and a Replica sequence of the same frames with exact poses and views off the
 path. The walk goes through all rooms and then through them again, lower and looking elsewhere;
@@ -22,7 +21,6 @@ import click
 import cv2
 import numpy as np
 import torch
-from make_large_walk import NOISE, QUALITY
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
@@ -49,6 +47,7 @@ SHAKE_M, SHAKE_DEG = 0.01, 0.8  # of the hand
 FPS = 10.0
 TESTS, OFF_M, OFF_DEG = 40, 0.15, 12.0  # views off the path
 DEPTH_EVERY, DEPTH_SCALE = 5, 6553.5
+NOISE, QUALITY = 2.0, 92  # 1/255, as a phone's frames by daylight; of JPEG
 
 
 @dataclass
@@ -248,37 +247,19 @@ def place(room: Room, door: Array, inward: Array) -> Room:
     return moved(room, Similarity(1.0, rotation, door - at))
 
 
-def build(living: Room, office: Room, third: Room, *, ring: bool) -> Apartment:
-    """Returns the apartment around a straight corridor, or around one that closes."""
+def build(living: Room, office: Room, third: Room) -> Apartment:
+    """Returns the apartment along a straight corridor."""
     draws = np.random.default_rng(1)
     x, y, z = np.eye(3)
-    if ring:
-        w, d = living.size[0] + 2 * WALL, living.size[1] + 2 * WALL
-        low, high = np.zeros(3), np.array([w, d, 0])
-        rim = np.array([WIDTH, WIDTH, 0])
-        outer_low, outer_high = low - rim, high + rim
-        doors = [(np.array([WALL + living.door, 0, 0]), y),
-                 (np.array([w / 2, outer_high[1], 0]), y), (np.array([w / 2, outer_low[1], 0]), -y)]
-        shells = [(low, high, {0: [doors[0][0][0]]}),
-                  (outer_low, outer_high,
-                   {0: [w / 2 + WIDTH], 2: [w / 2 + WIDTH]})]
-        m = WIDTH / 2
-        corridor = [np.array(c, float) for c in (
-            (-m, -m, 0), (w + m, -m, 0), (w + m, d + m, 0), (-m, d + m, 0), (-m, -m, 0))]
-        floors = [(outer_low, x * (w + 2 * WIDTH), y * WIDTH),
-                  (np.array([-WIDTH, d, 0]), x * (w + 2 * WIDTH), y * WIDTH),
-                  (np.array([-WIDTH, 0, 0]), x * WIDTH, y * d),
-                  (np.array([w, 0, 0]), x * WIDTH, y * d)]
-    else:
-        length = living.size[0] + office.size[0] + 3 * WALL
-        across = length / 2
-        doors = [(np.array([WALL + living.door, 0, 0]), y),
-                 (np.array([2 * WALL + living.size[0] + office.door, 0, 0]), y),
-                 (np.array([across, -WIDTH, 0]), -y)]
-        shells = [(np.array([0, -WIDTH, 0]), np.array([length, 0, 0]),
-                   {0: [across], 2: [length - door[0][0] for door in doors[:2]]})]
-        corridor = [np.array([0.5, -WIDTH / 2, 0]), np.array([length - 0.5, -WIDTH / 2, 0])]
-        floors = [(np.array([0, -WIDTH, 0]), x * length, y * WIDTH)]
+    length = living.size[0] + office.size[0] + 3 * WALL
+    across = length / 2
+    doors = [(np.array([WALL + living.door, 0, 0]), y),
+             (np.array([2 * WALL + living.size[0] + office.door, 0, 0]), y),
+             (np.array([across, -WIDTH, 0]), -y)]
+    shells = [(np.array([0, -WIDTH, 0]), np.array([length, 0, 0]),
+               {0: [across], 2: [length - door[0][0] for door in doors[:2]]})]
+    corridor = [np.array([0.5, -WIDTH / 2, 0]), np.array([length - 0.5, -WIDTH / 2, 0])]
+    floors = [(np.array([0, -WIDTH, 0]), x * length, y * WIDTH)]
     rooms = [place(room, *door) for room, door in zip((living, office, third), doors, strict=True)]
     parts = [room.splats for room in rooms]
     for room, door in zip((living, office, third), doors, strict=True):
@@ -352,11 +333,6 @@ def walk(apartment: Apartment) -> list[Array]:
     """Returns the cameras that a walk passes: each room, and each again."""
     keys: list[Array] = []
     spot = apartment.corridor[0]
-    if len(apartment.corridor) > 2:  # once around, to close the loop
-        middle = apartment.corridor[2]
-        keys += along_corridor(apartment, apartment.corridor[1] * 0 + spot, middle)
-        back = Apartment(apartment.splats, [], [], apartment.corridor[2:])
-        keys += along_corridor(back, middle, apartment.corridor[-1])[1:]
     for again in (False, True, True):
         order = [2, 1, 0] if again else [0, 1, 2]
         for index in order:
@@ -439,22 +415,15 @@ def write_sequence(
 @click.option("--frames", default=300, show_default=True)
 @click.option("--width", default=640, show_default=True)
 @click.option("--height", default=360, show_default=True)
-@click.option("--ring", is_flag=True, help="A corridor around the first room.")
-@click.option("--scene-only", is_flag=True, help="Write the apartment's Gaussians and no frames.")
-def main(
-    living: Path, office: Path, out: Path, frames: int, width: int, height: int, ring: bool,
-    scene_only: bool,
-) -> None:
+def main(living: Path, office: Path, out: Path, frames: int, width: int, height: int) -> None:
     """Writes the video and the sequence."""
     rooms = [load(living, (5.4, 4.6, 2.65), mirrored=False),
              load(office, (4.9, 4.2, 2.6), mirrored=False),
              load(living, (5.4, 4.6, 2.65), mirrored=True)]
-    apartment = build(*(with_door(room) for room in rooms), ring=ring)
+    apartment = build(*(with_door(room) for room in rooms))
     out.mkdir(parents=True, exist_ok=True)
     write_ply(out / "apartment.ply", apartment.splats)
     click.echo(f"{len(apartment.splats):,} Gaussians")
-    if scene_only:
-        return
     draws = np.random.default_rng(0)
     poses = resampled(walk(apartment), frames, draws)
     focal = width / 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,3 +94,12 @@ def reference_poses(path: Path) -> dict[str, NDArray[np.float64]]:
         return {f"{index:06d}.png": pose for index, pose in enumerate(lines)}
     return {f"{Path(image.name).stem}.png": np.linalg.inv(image.viewmat)
             for image in read_posed(path).images}
+
+
+def trident_poses(data: Path) -> dict[str, NDArray[np.float64]]:
+    """Returns the cameras of trident that others found; file k + 1 is frame k, OpenGL's axes."""
+    path = data / "walks" / "trident_desk" / "transforms_train.json"
+    return {
+        f"{int(''.join(filter(str.isdigit, Path(frame['file_path']).stem))) - 1:06d}.png":
+            np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]}

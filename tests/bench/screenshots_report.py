@@ -12,6 +12,7 @@ from pathlib import Path
 
 import click
 from PIL import Image
+from workbench import workspace_argument
 
 from recon_cli.pipeline.execute import Job
 from recon_cli.report.build import write_report
@@ -28,7 +29,7 @@ WIDTH, HEIGHT, GAP = 1060, 960, 24
 
 
 @click.command()
-@click.argument("workspace", type=click.Path(exists=True, path_type=Path))
+@workspace_argument
 def main(workspace: Path) -> None:
     """Writes the picture and says how large it is."""
     with tempfile.TemporaryDirectory() as folder, launch_browser() as started:

@@ -14,13 +14,15 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from damaged_videos import turn_before
 from numpy.typing import NDArray
+from workbench import mapping_job
 
 from recon_cli.config.stages import IngestConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.progress import NullProgress
 from recon_cli.sfm import features, mapper, matching
-from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.job import CLIP_SECONDS, MappingJob, Reporter
 from recon_cli.stages import ingest
 from recon_cli.workspace import records
 
@@ -195,18 +197,8 @@ def turning(data: Path, folder: Path) -> Path:
     photos = folder / "photos"
     photos.mkdir(exist_ok=True)
     picture = cv2.imread(str(sorted((data / "desk_monitors").rglob("*.[jJ]*"))[0]))
-    height, width = picture.shape[:2]
-    draws = np.random.default_rng(0)
-    wide = np.array([[0.6 * width, 0, width / 2], [0, 0.6 * width, height / 2], [0, 0, 1]])
-    narrow = np.array([[500.0, 0, 240], [0, 500.0, 180], [0, 0, 1]])
-    for index in range(40):
-        angle = np.radians(-25 + 50 * index / 39)
-        tilt = np.radians(5 * np.sin(index / 4))
-        turn = cv2.Rodrigues(np.array([tilt, angle, 0.02 * np.cos(index / 3)]))[0]
-        warp = narrow @ turn @ np.linalg.inv(wide)
-        image = cv2.warpPerspective(picture, warp, (480, 360), flags=cv2.INTER_AREA)
-        noisy = image + draws.normal(0, 2, image.shape)
-        cv2.imwrite(str(photos / f"{index:06d}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
+    for index, image in enumerate(turn_before(picture, 40, 9.75)):
+        cv2.imwrite(str(photos / f"{index:06d}.png"), image)
     return photos
 
 
@@ -251,16 +243,8 @@ def quiet() -> Reporter:
 def job_of(capture: Capture, folder: Path) -> MappingJob:
     """The job of a capture whose frames are chosen; its database lies in the folder."""
     frames = records.read_frame_list(folder)
-    groups = tuple(
-        CameraGroup(tuple(frame.name for frame in frames.frames if frame.group == index),
-                    group.width, group.height, group.focal_px, group.lens)
-        for index, group in enumerate(frames.groups))
-    return MappingJob(
-        frames=folder / records.FOLDER, denoised=folder / records.FOLDER, out=folder,
-        groups=groups, masks=None, poses=None, pose_use="ignore", given_points=False, pairs="auto",
-        max_features=capture.features, min_registered=0.5, accept_weak=True, partial=False,
-        gravity=False, scale_between=None, max_minutes=60, seed=0, threads=1,
-        sharpness={},
+    return mapping_job(
+        folder, folder, max_features=capture.features, accept_weak=True,
         times={frame.name: frame.time_seconds + CLIP_SECONDS * frame.group
                for frame in frames.frames if frame.time_seconds is not None})
 

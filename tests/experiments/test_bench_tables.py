@@ -27,9 +27,8 @@ from recon_cli.experiments.instruments import (
     alternate,
     peak_fraction,
     rate,
-    timing_of,
 )
-from recon_cli.experiments.outputs import OutputFiles
+from recon_cli.experiments.outputs import OutputFiles, Result
 from recon_cli.experiments.rasterizer_benchmark import (
     BenchRequest,
     check_comparable,
@@ -63,21 +62,21 @@ def result(numba_ms: float = 10.0, torch_ms: float = 80.0) -> BenchResult:
     host = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
     variants = [
         VariantResult("contract", Timing(30.0, 0.0), EXACT),
-        VariantResult("rough", Timing(20.0, 0.0), ROUGH), VariantResult("untimed", None, ROUGH)]
+        VariantResult("rough", Timing(20.0, 0.0), ROUGH)]
     scene = BenchedScene(
-        1000, 64, 48, 3, {"numba": backend(numba_ms), "torch": backend(torch_ms)},
-        {"torch": Timing(9.0, 0.0), "fused": Timing(3.0, 0.0)}, "numba", variants)
+        1000, 64, 48, 3, {"numba": backend(numba_ms), "torch": backend(torch_ms)}, "numba",
+        variants)
     return BenchResult(host, 7, {"room": scene})
 
 
 # ---- medians and rates ----
 
 def test_a_timing_is_median_and_interquartile_range() -> None:
-    assert timing_of([5.0, 1.0, 2.0, 4.0, 3.0]) == Timing(3.0, 2.0)
-    assert timing_of([2.0, 4.0]) == Timing(3.0, 1.0)
-    assert timing_of([7.0]) == Timing(7.0, 0.0)
+    assert Timing.from_samples([5.0, 1.0, 2.0, 4.0, 3.0]) == Timing(3.0, 2.0)
+    assert Timing.from_samples([2.0, 4.0]) == Timing(3.0, 1.0)
+    assert Timing.from_samples([7.0]) == Timing(7.0, 0.0)
     with pytest.raises(ValueError, match="no samples"):
-        timing_of([])
+        Timing.from_samples([])
 
 
 def test_candidates_take_turns_and_the_first_round_is_not_counted() -> None:
@@ -132,7 +131,6 @@ def test_the_figures_are_ratios_of_what_was_measured() -> None:
     assert rows["Gpairs/s a core, forward"] == ("2", "2")
     assert rows["of the core's peak, forward"] == ("25%", "25%")
     assert rows["of the core's peak, backward"] == ("-", "-")
-    assert rows["loss torch : fused"] == ("3.00x", "")
     assert "interquartile range" in head(found)
     assert "A CPU, 2 of 2 cores" in head(found)
 
@@ -142,7 +140,7 @@ def test_every_stage_error_and_approximation_has_a_row() -> None:
     assert ("numba forward: composite", "7.5 (0)", "5 (0)", "2", "25%") in stages.rows
     assert [row[0] for row in errors.rows] == ["numba", "torch"]
     assert [row[:3] for row in variants.rows] == [
-        ("contract", "30 (0)", "0"), ("rough", "20 (0)", "10"), ("untimed", "-", "-")]
+        ("contract", "30 (0)", "0"), ("rough", "20 (0)", "10")]
     assert variants.rows[1][3:] == ("0.1", "0.01", "50%", "0.2", "quats", "0.1")
 
 
@@ -246,7 +244,7 @@ def test_a_page_without_its_marks_is_refused_and_left_alone(text: str, tmp_path:
     path = tmp_path / "page.md"
     path.write_text(text)
     with pytest.raises(FormatError, match="recon bench: begin"):
-        OutputFiles(markdown=path).write({}, "head", [], lambda _path: None)
+        OutputFiles(markdown=path).write(Result({}, "head", []))
     assert path.read_text() == text
 
 

@@ -41,21 +41,17 @@ def point(seconds: float, psnr_db: float) -> CurvePoint:
         int(100 * seconds), seconds, 2 * seconds, 1000, 250_000, psnr_db, psnr_db / 40)
 
 
-def wall(one: CurvePoint) -> float:
-    return one.seconds
-
-
 # ---- curves ----
 
 def test_a_target_is_reached_on_the_line_between_two_points() -> None:
     curve = [point(0, 10), point(2, 20), point(3, 18), point(5, 30)]
-    assert seconds_to(curve, 15, wall) == pytest.approx(1.0)
-    assert seconds_to(curve, 15, lambda one: one.cpu_seconds) == pytest.approx(2.0)
-    assert seconds_to(curve, 20, wall) == 2.0
-    assert seconds_to(curve, 19, wall) == pytest.approx(1.8)  # the first time, not after the dip
-    assert seconds_to(curve, 24, wall) == pytest.approx(4.0)
-    assert seconds_to(curve, 5, wall) == 0.0
-    assert seconds_to(curve, 30.1, wall) is None
+    assert seconds_to(curve, 15, "seconds") == pytest.approx(1.0)
+    assert seconds_to(curve, 15, "cpu_seconds") == pytest.approx(2.0)
+    assert seconds_to(curve, 20, "seconds") == 2.0
+    assert seconds_to(curve, 19, "seconds") == pytest.approx(1.8)  # not after the dip
+    assert seconds_to(curve, 24, "seconds") == pytest.approx(4.0)
+    assert seconds_to(curve, 5, "seconds") == 0.0
+    assert seconds_to(curve, 30.1, "seconds") is None
 
 
 def test_all_runs_reach_the_common_target() -> None:

@@ -107,7 +107,7 @@ def test_a_table_says_what_is_equal_in_each_control():
     text = table([
         SweepTrial(Sweep.CONTROL, None, 100, 60, 6.0, None, good),
         SweepTrial("loo", 0.8, 20, 60, 3.0, MeanScore(20.0, 0.5), good),
-        SweepTrial(Sweep.CONTROL, 0.8, 100, 30, 3.0, None, good)], "loo")
+        SweepTrial(Sweep.CONTROL, 0.8, 100, 30, 3.0, None, good)], "loo").text()
     lines = text.splitlines()
     assert "equal steps" in lines[1]
     assert "80%" in lines[2]
