@@ -7,6 +7,7 @@ data of others: a numpy.py there would be run. Nothing else in the package start
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -15,6 +16,9 @@ from typing import IO
 
 SAFE_PATH = "PYTHONSAFEPATH"
 CHILD = "RECON_JOB"  # environment variable of a command that ends with the one that started it
+# Of Windows, where a session is a group of processes; elsewhere the flag is no flag.
+_OWN_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+_END: int = getattr(signal, "CTRL_BREAK_EVENT", signal.SIGTERM)
 
 
 def protect_children() -> None:
@@ -52,7 +56,22 @@ def start_module(
     """
     return subprocess.Popen(
         python_command("-m", module, *arguments), cwd=folder, stdin=subprocess.PIPE, stdout=out,
-        stderr=errors, start_new_session=session, env=child_environment(**environment))
+        stderr=errors, start_new_session=session, creationflags=_OWN_GROUP if session else 0,
+        env=child_environment(**environment))
+
+
+def ask_to_end(process: subprocess.Popen[bytes]) -> None:
+    """Asks a child with a session of its own to save what it has and end.
+
+    Not by SIGINT, which may be ignored in the background. `terminate` of Windows kills; children
+    there understand Ctrl-Break, which needs a console.
+    """
+    try:
+        process.send_signal(_END)
+    except ProcessLookupError:  # it has ended
+        pass
+    except OSError:
+        process.terminate()
 
 
 def run_code(code: str) -> str:

@@ -1,5 +1,7 @@
 """Signals that end a command: Ctrl-C, SIGTERM (docker stop, timeout, systemd) and SIGHUP.
 
+Windows has no SIGHUP; Ctrl-Break and the end of a console stand for SIGTERM there.
+
 The first one raises `Interrupted` in the main thread, so that what is unfinished is saved and
 children end. Programs such as `timeout` send it twice, so another one counts only a while later: it
 ends the process at once, and with it its children, whose standard input ends.
@@ -13,13 +15,15 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType
 
 from recon_cli.errors import ExitCode
 
 NUMBERS = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+    if hasattr(signal, name))
+_BREAK: int | None = getattr(signal, "SIGBREAK", None)  # of Windows
 _TWICE_SECONDS = 1.0  # within which signals are one
 _SIGACTION_BYTES = 1024  # more than a struct sigaction has on any system
 
@@ -54,6 +58,7 @@ class _Watch:
 
     def handle(self, number: int, _frame: FrameType | None) -> None:
         """Raises Interrupted for the first signal; ends the process by a later one."""
+        number = signal.SIGTERM if number == _BREAK else number
         again = time.monotonic() - self._last < _TWICE_SECONDS
         self._last = time.monotonic()
         if self.number and again:
@@ -126,20 +131,26 @@ def keeping_handlers() -> Iterator[None]:
 
     Native code replaces them behind Python's back, perhaps in a thread, where Python sets none.
     """
-    if os.name != "posix":
-        yield
-        return
+    handlers = {number: signal.getsignal(number) for number in NUMBERS}
+    with _keeping_actions() if os.name == "posix" else nullcontext():
+        try:
+            yield
+        finally:
+            if threading.current_thread() is threading.main_thread():
+                for number, handler in handlers.items():
+                    if handler is not None:
+                        signal.signal(number, handler)
+
+
+@contextmanager
+def _keeping_actions() -> Iterator[None]:
+    """Puts back what the system does at each signal; only POSIX lets any thread do so."""
     libc = ctypes.CDLL(None)
     actions = {number: ctypes.create_string_buffer(_SIGACTION_BYTES) for number in NUMBERS}
     for number, action in actions.items():
         libc.sigaction(number, None, action)
-    handlers = {number: signal.getsignal(number) for number in NUMBERS}
     try:
         yield
     finally:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in handlers.items():
-                if handler is not None:
-                    signal.signal(number, handler)
         for number, action in actions.items():
             libc.sigaction(number, action, None)

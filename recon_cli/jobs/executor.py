@@ -7,10 +7,10 @@ is can be read in the workspace.
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -19,7 +19,7 @@ from filelock import FileLock, Timeout
 
 from recon_cli import machine
 from recon_cli.errors import ExitCode
-from recon_cli.processes import CHILD, start_module
+from recon_cli.processes import CHILD, ask_to_end, start_module
 from recon_cli.workspace.layout import LOCK
 
 PROGRAM = "recon_cli"  # the module that is run
@@ -114,8 +114,7 @@ class RunningCommand:
         self._stopped.set()
         process = self._process
         if process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                process.terminate()  # not by SIGINT, which may be ignored in the background
+            ask_to_end(process)
             timer = threading.Timer(_STOP_SECONDS, process.kill)
             timer.daemon = True
             timer.start()
@@ -174,6 +173,6 @@ def _wait_until_free(workspace: Path) -> None:
     A process that holds the workspace for longer is somebody else's; the command says so.
     """
     lock = FileLock(workspace / LOCK)
-    with contextlib.suppress(Timeout):
+    with suppress(Timeout):
         lock.acquire(timeout=_LOCK_SECONDS)
         lock.release()

@@ -7,8 +7,8 @@ their own, of which each may fail alone.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,7 +81,7 @@ def run_jobs(
     with ThreadPoolExecutor(executor.slots) as threads:
         futures = {threads.submit(run, index): index for index in range(len(jobs))}
         try:
-            for future in as_completed(futures):
+            for future in _as_they_end(futures):
                 index = futures[future]
                 ends[index] = future.result()
                 report(jobs[index], ends[index])
@@ -97,6 +97,14 @@ def describe_failures(failed: Mapping[str, str], total: int, what: str) -> str:
     """Returns in a sentence how many of `total` failed and why; `failed` are reasons by name."""
     reasons = list_names([f"{name}: {reason.rstrip('.')}" for name, reason in failed.items()])
     return f"{len(failed)} of {total} {what} failed ({reasons})."
+
+
+def _as_they_end(futures: Iterable[Future[JobEnd]]) -> Iterator[Future[JobEnd]]:
+    """Yields futures as they end; Ctrl-C on Windows waits for the end of a wait."""
+    left = set(futures)
+    while left:
+        done, left = wait(left, timeout=_LOOK_SECONDS, return_when=FIRST_COMPLETED)
+        yield from done
 
 
 def _look(job: SharedJob) -> tuple[float, str]:

@@ -75,14 +75,17 @@ def name_captures(inputs: Sequence[Path], out: Path) -> tuple[Capture, ...]:
     twice = [str(path) for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise ConfigError(f"{twice[0]} is given more than once.", hint="Give every input once.")
-    stems = Counter(_stem(path) for path in paths)
-    names = [_stem(path) if stems[_stem(path)] == 1 else f"{path.parent.name}-{_stem(path)}"
-             for path in paths]
-    for name, count in Counter(names).items():
+    # Room and room are one folder on macOS and Windows
+    stems = Counter(_stem(path).casefold() for path in paths)
+    names = [_stem(path) if stems[_stem(path).casefold()] == 1 else
+             f"{path.parent.name}-{_stem(path)}" for path in paths]
+    for name, count in Counter(name.casefold() for name in names).items():
         if count > 1:
-            same = [str(path) for path, other in zip(paths, names, strict=True) if other == name]
+            same = [str(path) for path, other in zip(paths, names, strict=True)
+                    if other.casefold() == name]
             raise ConfigError(
-                f"{' and '.join(same)} would both be reconstructed in {out / name}.",
+                f"{' and '.join(same)} would both be reconstructed in "
+                f"{out / names[paths.index(Path(same[0]))]}.",
                 hint="Rename one of them, or give them to batches with different --out.")
     return tuple(
         Capture(name, path, out.absolute() / name)

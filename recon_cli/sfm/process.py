@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from recon_cli.errors import ReconError, SfmError
+from recon_cli.errors import ExitCode, ReconError, SfmError
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
@@ -208,7 +208,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
     how = f"stopped with exit code {code}" if code >= 0 else (
         f"was ended by {names.get(-code, f'signal {-code}')}")
     hint = "Run it again: features and matches found so far are kept."
-    if code == -signal.SIGKILL:
+    if code == ExitCode.SIGNAL - ExitCode.KILLED:
         hint = (
             "The system may have run out of memory; try --max-features 1024 or fewer frames "
             "(`recon ingest --frames N`).")

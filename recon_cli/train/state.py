@@ -153,7 +153,9 @@ def load_state(
     try:
         with safe_open(path, framework="pt") as file:
             scalars = parse_json((file.metadata() or {})["state"], dict, finite=False)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            # copies, for views keep the file open, which Windows then refuses to replace
+            tensors = {
+                name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
         if scalars["version"] != _VERSION:
             raise KeyError("version")
         generator = torch.Generator()

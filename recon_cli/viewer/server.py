@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import ipaddress
 import logging
+import os
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -87,7 +88,8 @@ def _is_free(host: str, port: int) -> bool:
             hint=f"Omit --host for {HOST}.") from error
     for family, kind, protocol, _, address in addresses:
         with socket.socket(family, kind, protocol) as trial:
-            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as asyncio listens
+            if os.name == "posix":  # as asyncio listens; elsewhere it would let two share a port
+                trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 trial.bind(address)
                 trial.listen()

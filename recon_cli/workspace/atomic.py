@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import FormatError
-from recon_cli.workspace import journal
+from recon_cli.workspace import durable, journal
 from recon_cli.workspace.paths import describe_special
 
 MAX_TEXT_BYTES = 256 << 20  # of a JSON or TOML file; parsing takes some twenty times as much memory
@@ -39,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         journal.make_way(path)
         journal.expect(path, temporary)
-        temporary.replace(path)
+        durable.replace(temporary, path)
         journal.confirm(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -175,8 +175,4 @@ def clear_leftovers(folder: Path) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Flushes a folder's entries, so that a rename in it survives a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    durable.flush(folder)

@@ -17,9 +17,8 @@ from recon_cli.errors import ReconError, WorkspaceError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _WORDS = {
-    os.strerror(errno.ENOSPC): errno.ENOSPC,
-    os.strerror(errno.EDQUOT): errno.EDQUOT,
-    os.strerror(errno.EFBIG): errno.EFBIG,
+    **{words: number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+       if not (words := os.strerror(number)).startswith("Unknown error")},  # EDQUOT on Windows
     "database or disk is full": errno.ENOSPC,  # of SQLite
 }
 # What is wrong with a path or the system, not with recon.

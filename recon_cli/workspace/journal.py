@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from recon_cli.workspace import durable
 from recon_cli.workspace.paths import is_plain_file
 
 PARTIAL = ".partial"  # the folder, in a workspace, of what is not finished
@@ -85,8 +86,7 @@ def expect_growth(path: Path) -> None:
     """Records what `path` holds now; what is appended to it later does not count."""
     place = _find(path)
     if place:
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
+        durable.flush(path)
         size = path.stat().st_size
         _append(*place, "grows", size, crc32(path, size), flush=True)
 
@@ -163,7 +163,7 @@ def _append(journal: Path, name: str, *values: object, flush: bool = False) -> N
     """Adds a line in one write, so that lines of several threads do not mix."""
     text = json.dumps([name, *values])
     line = f"{zlib.crc32(text.encode()):08x} {text}\n".encode()
-    descriptor = os.open(journal, os.O_WRONLY | os.O_APPEND)
+    descriptor = os.open(journal, os.O_WRONLY | os.O_APPEND | getattr(os, "O_BINARY", 0))
     try:
         os.write(descriptor, line)
         if flush:

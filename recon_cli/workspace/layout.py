@@ -27,7 +27,7 @@ import psutil
 from filelock import FileLock, Timeout
 
 from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
-from recon_cli.workspace import disk, journal, manifest
+from recon_cli.workspace import disk, durable, journal, manifest
 from recon_cli.workspace.atomic import LEFTOVERS, clear_leftovers, read_json, sync_folder
 from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import (
@@ -172,7 +172,7 @@ class Workspace:
             name = path.relative_to(folder).as_posix()
             if name in without:
                 continue
-            _flush(path)
+            durable.flush(path)
             if path.is_file():
                 outputs[name] = digest_file(path)
         return outputs
@@ -321,14 +321,6 @@ def _complete(folder: Path) -> bool:
         return False
 
 
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def remove(path: Path) -> None:
     """Removes a file, a link, or a folder with all that is in it, if it is there."""
     if path.is_dir() and not path.is_symlink():
@@ -342,14 +334,14 @@ def link_or_copy(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target, follow_symlinks=False)
-    except OSError:  # not every file system has hard links, nor do they lead to another one
+    except (OSError, NotImplementedError):  # not every file system has hard links, nor across two
         shutil.copy2(source, target, follow_symlinks=False)
 
 
 def move(source: Path, target: Path) -> None:
     """Renames a folder to where nothing is, also to another file system: whole or not at all."""
     try:
-        source.rename(target)
+        durable.rename(source, target)
     except OSError as error:
         if error.errno != errno.EXDEV:
             raise
@@ -358,7 +350,7 @@ def move(source: Path, target: Path) -> None:
         shutil.copytree(source, copy, symlinks=True)
         for path in copy.rglob("*"):
             if not path.is_symlink():
-                _flush(path)
+                durable.flush(path)
         copy.rename(target)
         sync_folder(target.parent)
         remove(source)
@@ -399,7 +391,7 @@ def _name_holder(path: Path, verb: str) -> None:
         remove(path)
         path.write_text(json.dumps({
             "pid": os.getpid(), "host": socket.gethostname(), "verb": verb,
-            "since": datetime.now().astimezone().isoformat(timespec="seconds")}))
+            "since": datetime.now().astimezone().isoformat(timespec="seconds")}), encoding="utf-8")
 
 
 def _describe_holder(root: Path) -> str:
