@@ -131,7 +131,7 @@ def _module(name: str, file: str) -> str:
 
 
 def _text(name: str) -> str:
-    return (files("recon_cli.io.splats") / "web" / name).read_text(encoding="utf-8")
+    return (files("recon_cli.splats") / "web" / name).read_text(encoding="utf-8")
 
 
 _OPENED = re.compile(rb'<script id="scene" type="application/octet-stream" '
