@@ -1,4 +1,4 @@
-"""What a splat file of any program holds: its Gaussians, and what it says about them."""
+"""The content of a splat file of any program: its Gaussians, and its statements about them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Origin:
         return " ".join(f"{value:.12g}" for value in self.point)
 
     def describe(self) -> str:
-        """Returns what was done and why, as the end of a sentence that begins with the file."""
+        """Returns the change and its reason, as the end of a sentence that begins with the file."""
         done = (f"float32 rounds its positions by up to {self.rounding:.2g} units, where Gaussians "
                 f"have {self.size:.2g}, so {self} is subtracted from all of them")
         if not self.rounded:
@@ -33,6 +33,6 @@ class LoadedScene:
     """A scene in the axes of recon."""
 
     splats: Splats
-    up: str | None = None  # the axis that is up by what the file says: z, -y or y; None if nothing
-    antialiased: bool = False  # it says that it was trained with antialiasing (Mip-Splatting)
-    origin: Origin | None = None  # what was subtracted from all positions; None for nothing
+    up: str | None = None  # axis that the file says is up: z, -y or y; None if it does not
+    antialiased: bool = False  # the file says: trained with antialiasing (Mip-Splatting)
+    origin: Origin | None = None  # subtracted from all positions; None if nothing was

@@ -35,7 +35,7 @@ def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
 def compact_order(
     points: NDArray[np.float32], weights: NDArray[np.floating], chunk: int
 ) -> NDArray[np.int64]:
-    """Returns the Morton order of points [N, 3], with what lies far outside before all others.
+    """Returns the Morton order of points [N, 3], with the far outliers before all others.
 
     It comes by shells, the farthest one first: what shares a chunk with points far away is left
     few bits for its place. The last such chunk is filled with the points of the least weights [N].
@@ -90,14 +90,14 @@ class UntrustedFile:
     def json_object(self, text: bytes) -> dict[str, Any]:
         """Returns a JSON object without NaN that is not nested too deeply."""
         def refuse_constant(name: str) -> float:
-            raise ValueError(f"{name} is no number of JSON")
+            raise ValueError(f"{name} is not a number of JSON")
 
         try:
             value = json.loads(text, parse_constant=refuse_constant)
         except (ValueError, RecursionError) as error:
             raise self.error(f"JSON that cannot be read: {error}") from error
         if not isinstance(value, dict):
-            raise self.error("JSON that cannot be read: it is no object")
+            raise self.error("JSON that cannot be read: it is not an object")
         return value
 
     def whole(

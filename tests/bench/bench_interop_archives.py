@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from recon_cli.render.registry import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.splats.glb import read_glb, write_glb
+from recon_cli.splats.glb import load_glb, write_glb
 from recon_cli.splats.lod import make_levels, read_lod, write_lod
 from recon_cli.splats.ply import read_ply, write_ply
-from recon_cli.splats.sog import Unpacked, read_files, read_sog, write_sog
+from recon_cli.splats.sog import Unpacked, load_sog, read_files, write_sog
 
 # From the axes that splat-transform takes a .ply for to those of glTF: half a turn about z.
 THEIR_AXES: NDArray[np.float64] = np.diag([-1.0, -1, 1])
@@ -85,9 +85,9 @@ def interop(node: Path, folder: Path) -> None:
         write_lod(folder / "lod" / "lod-meta.json", make_levels(splats))
         convert(node, folder / "lod" / "0_0" / "meta.json", folder / "part.ply")
         for label, one, other in (
-            ("our .sog, our reader against theirs", read_sog(folder / "ours.sog"),
+            ("our .sog, our reader against theirs", load_sog(folder / "ours.sog").splats,
              read_ply(folder / "ours.ply")),
-            ("their .sog, our reader against theirs", read_sog(folder / "theirs.sog"),
+            ("their .sog, our reader against theirs", load_sog(folder / "theirs.sog").splats,
              read_ply(folder / "theirs.ply")),
             ("their lod-meta.json, our reader against the scene",
              read_lod(folder / "theirs" / "lod-meta.json"), read_ply(folder / "lod.ply")),
@@ -95,10 +95,10 @@ def interop(node: Path, folder: Path) -> None:
              read_files(Unpacked(folder / "lod" / "0_0" / "meta.json")),
              read_ply(folder / "part.ply")),
             ("their .glb, our reader against the scene",
-             read_glb(folder / "theirs.glb", axes=THEIR_AXES), splats),
+             load_glb(folder / "theirs.glb", axes=THEIR_AXES).splats, splats),
             ("their turned .glb against ours, as they are in the file",
-             read_glb(folder / "turned.glb", axes=np.eye(3)),
-             read_glb(folder / "ours.glb", axes=np.eye(3))),
+             load_glb(folder / "turned.glb", axes=np.eye(3)).splats,
+             load_glb(folder / "ours.glb", axes=np.eye(3)).splats),
         ):
             click.echo(f"degree {degree}, {label}: {difference(one, other)}")
         click.echo(f"degree {degree}, validator on our .glb, beyond the extension: "
@@ -132,7 +132,7 @@ def sizes(splats: Splats, folder: Path) -> None:
     write_sog(folder / "scene.sog", splats)
     writing = time.process_time() - start
     start = time.process_time()
-    back = read_sog(folder / "scene.sog")
+    back = load_sog(folder / "scene.sog").splats
     reading = time.process_time() - start
     plain, small = ((folder / name).stat().st_size for name in ("scene.ply", "scene.sog"))
     click.echo(

@@ -19,7 +19,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.splats.axes import turn_from
 from recon_cli.splats.html import default_view, read_html, write_html
-from recon_cli.splats.spz import read_spz, spz_bytes
+from recon_cli.splats.spz import load_spz, spz_bytes
 
 Y_DOWN = np.array([0.0, -1, 0])
 HOSTILE = '</script><script>alert(1)</script>"><img src=x onerror=alert(2)><!-- $scene &lt; \u2028'
@@ -76,7 +76,7 @@ def test_a_page_reads_back_as_the_spz_of_the_same_scene(tmp_path, degree):
         tmp_path / "a.spz", turn_from("rub", splats), harmonic_step=1, axes=None)
     (tmp_path / "a.spz").write_bytes(finest)
     page = read_html(tmp_path / "a.html")
-    spz = read_spz(tmp_path / "a.spz", axes="rub")
+    spz = load_spz(tmp_path / "a.spz", axes="rub").splats
     assert torch.allclose(page.means, splats.means, atol=1e-3)
     for name, value in spz.parameters().items():
         assert torch.equal(getattr(page, name), value), name

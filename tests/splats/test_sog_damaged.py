@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from recon_cli.errors import FormatError
-from recon_cli.splats.sog import encode_webp, read_sog, write_sog
+from recon_cli.splats.sog import encode_webp, load_sog, write_sog
 
 COUNT = 70  # a palette of 5, images of 9 x 8
 
@@ -64,7 +64,7 @@ def claimed(width, height):
 def read(tmp_path, data):
     (tmp_path / "a.sog").write_bytes(data)
     with damage.little_memory():
-        return read_sog(tmp_path / "a.sog")
+        return load_sog(tmp_path / "a.sog").splats
 
 
 def refused(tmp_path, data, said):
@@ -97,7 +97,7 @@ def test_what_is_no_sog_is_refused(tmp_path, data, said):
 
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(FormatError, match="cannot be read"):
-        read_sog(tmp_path / "none.sog")
+        load_sog(tmp_path / "none.sog")
 
 
 @pytest.mark.parametrize("name", [
@@ -220,7 +220,7 @@ def test_a_gaussian_takes_a_byte_in_files_of_millions(tmp_path, good):
 def _survives(path, data):
     path.write_bytes(data)
     with contextlib.suppress(FormatError):
-        assert read_sog(path).means.shape[1] == 3
+        assert load_sog(path).splats.means.shape[1] == 3
 
 
 CAREFUL = settings(

@@ -16,7 +16,7 @@ from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0
 from recon_cli.splats.ply import read_ply
-from recon_cli.splats.registry import FORMATS, scene_file
+from recon_cli.splats.registry import FORMATS, splat_file
 from recon_cli.stages import export
 
 
@@ -116,7 +116,7 @@ def test_a_palette_that_loses_too_much_gets_more_entries(inputs, tmp_path):
 @pytest.mark.parametrize("name", ["ply", "spz", "sog"])
 def test_a_file_is_no_larger_than_asked_for(inputs, whole, tmp_path, name):
     exported(inputs, tmp_path, format=name, drop_backdrop=True)
-    path = scene_file(tmp_path, name)
+    path = splat_file(tmp_path, name)
     most = 0.6 * path.stat().st_size / 1e6
     summary = exported(inputs, tmp_path, format=name, max_mb=most, drop_backdrop=True)
     assert path.stat().st_size <= 1e6 * most

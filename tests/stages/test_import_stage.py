@@ -20,7 +20,7 @@ from recon_cli.scene.splats import transformed
 from recon_cli.splats.axes import turn_from
 from recon_cli.splats.glb import nearest_axes, write_glb
 from recon_cli.splats.ply import describe_scene, read_ply, write_ply
-from recon_cli.splats.registry import FORMATS, load_scene, scene_file
+from recon_cli.splats.registry import FORMATS, load_splats, splat_file
 from recon_cli.splats.spz import write_spz
 from recon_cli.stages import evaluate, export, import_scene, prune
 from recon_cli.train.train_data import read_config
@@ -110,7 +110,7 @@ def test_without_views_nothing_is_moved_and_the_record_says_so(tmp_path):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_comes_in(tmp_path, name):
-    path = scene_file(tmp_path, name)
+    path = splat_file(tmp_path, name)
     FORMATS[name].write(path, truth())
     summary = brought_in(path, None, tmp_path / "train")
     assert (summary.format, summary.gaussians) == (name, 60)
@@ -278,7 +278,7 @@ def test_what_was_trained_with_antialiasing_is_recorded_said_and_exported(tmp_pa
     (tmp_path / "export").mkdir()
     export.run(config, StageInputs({"train": tmp_path / "train"}), tmp_path / "export", CONTEXT)
     for name in config.formats:
-        assert load_scene(tmp_path / "export" / f"splats.{name}").antialiased, name
+        assert load_splats(tmp_path / "export" / f"splats.{name}").antialiased, name
 
 
 def test_a_scene_that_was_moved_is_exported_with_the_point_it_was_moved_from(tmp_path):

@@ -16,7 +16,7 @@ import torch
 
 from recon_cli.cli import main
 from recon_cli.commands import view
-from recon_cli.splats.registry import FORMATS, scene_file
+from recon_cli.splats.registry import FORMATS, splat_file
 from recon_cli.viewer.content import load_file
 
 pytestmark = pytest.mark.floors
@@ -44,7 +44,7 @@ def test_it_prints_its_address_and_opens_no_browser_where_there_is_no_terminal(
 @pytest.mark.usefixtures("ended")
 @pytest.mark.parametrize("name", list(FORMATS))
 def test_a_file_of_any_format_is_shown_without_cameras(room, tmp_path, name):
-    path = scene_file(tmp_path, name)
+    path = splat_file(tmp_path, name)
     FORMATS[name].write(path, FORMATS["ply"].read(room / "train" / "splats.ply"))
     content = load_file(path)
     assert [len(packed.splats) for packed in content.models.values()] == [60]
