@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
+import shutil
 import tempfile
 from functools import cached_property
 from pathlib import Path
@@ -11,19 +13,25 @@ from pathlib import Path
 import numpy as np
 
 from recon_cli.config.stages import ExportConfig
+from recon_cli.datasets.transforms import write_transforms
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.export.camera_files import write_cameras
 from recon_cli.export.reduce import lower_degrees
 from recon_cli.export.source import ExportSource
+from recon_cli.io.colmap import write_colmap
+from recon_cli.io.meshes import write_point_cloud
 from recon_cli.room.files import write_mesh_file, write_plan
 from recon_cli.room.measures import RoomFrame
 from recon_cli.room.mesh import MeshResult, build_mesh
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import write_points
 from recon_cli.splats.registry import FORMATS
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
 from recon_cli.workspace.export_record import ExportedFile, max_loss_db
+
+_IMAGES = "images"
+_SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
 
 logger = logging.getLogger("recon")
 
@@ -69,7 +77,7 @@ class FormatWriter:
                 inside = self._splats.within(*self._source.room)
                 write_points(self._out / row.file, self._splats.select(inside))
             case "cameras":
-                write_cameras(self._out, row, self._source)
+                _write_cameras(self._out, row, self._source)
             case "mesh":
                 write_mesh_file(self._out / row.file, self._mesh, self._source.frame.up)
             case "plan":
@@ -83,15 +91,15 @@ class FormatWriter:
         path = self._out / row.file
         most = max_loss_db(row.name, dataclasses.asdict(self._config))
         gain = self._write_until_good(row, path, most)
-        size, whole = _file_size(row, path), (self._out / "splats.ply").stat().st_size
-        text = f"{row.name}: {whole / size:.1f}x smaller, {gain:+.2f} dB"
+        size, ply_size = _file_size(row, path), (self._out / "splats.ply").stat().st_size
+        text = f"{row.name}: {ply_size / size:.1f}x smaller, {gain:+.2f} dB"
         if not gain >= -most:  # a NaN fails too
             raise ReconstructionError(
                 f"{text} on {self._source.psnr.describe()}, but it may lose {most:g} dB at most.",
                 hint="Leave this format out, or allow more with --max-loss.")
         logger.info("%s", text)
         return ExportedFile(
-            file=row.file, bytes=size, smaller=round(whole / size, 3),
+            file=row.file, bytes=size, smaller=round(ply_size / size, 3),
             psnr_change_db=round(gain, 4))
 
     def _write_until_good(self, row: ExportFormat, path: Path, most: float) -> float:
@@ -99,7 +107,7 @@ class FormatWriter:
         form, settings = FORMATS[row.name], _settings(row, self._config, self._source)
         splats = lower_degrees(self._splats, self._source).at(row.sh_degree)
         limited = self._config.max_mb is not None and row.name == self._config.formats[0]
-        gain = -np.inf
+        gain = -math.inf
         for sharing in row.sharing:
             form.write(path, splats, dataclasses.replace(settings, sharing=sharing))
             if limited and _file_size(row, path) > 1e6 * (self._config.max_mb or 0):
@@ -129,3 +137,30 @@ def _file_size(row: ExportFormat, path: Path) -> int:
     if "/" not in row.file:
         return path.stat().st_size
     return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+
+
+def _write_cameras(out: Path, row: ExportFormat, source: ExportSource) -> None:
+    """Writes the cameras in one of the formats of this kind, and copies the images."""
+    cameras, scene = _copy_images(out, source), source.scene
+    if row.index:  # a folder: a model of COLMAP
+        shutil.rmtree(out / row.file, ignore_errors=True)  # of a run that was killed
+        write_colmap(out / row.file, cameras, source.points, scene.colors)
+        return
+    points = None
+    if len(scene.points):
+        points = _SPARSE
+        write_point_cloud(out / points, source.points, scene.colors)
+    write_transforms(
+        out / row.file, [(f"{_IMAGES}/{name}", camera) for name, camera in cameras],
+        held_out={f"{_IMAGES}/{view.name}" for view in scene.test}, points=points)
+
+
+def _copy_images(out: Path, source: ExportSource) -> list[tuple[str, Camera]]:
+    """Copies the undistorted images, and returns all cameras, which are useless without."""
+    scene = source.scene
+    every = (*scene.train, *scene.validation, *scene.test)
+    for view in every:
+        target = out / _IMAGES / view.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(view.original, target)
+    return source.place(every)

@@ -85,13 +85,13 @@ def made_of(
 ) -> dict[str, Any]:
     """Returns what a file of a format would be made of now, as JSON values."""
     stages = ["ingest", "sfm"]
-    shown = {}
+    model_shown = {}
     if EXPORT_FORMATS[name].kind != "cameras":
         stages += ["train", "prune"] if model == "pruned" else ["train"]
-        shown = {"model": model}
+        model_shown = {"model": model}
     digests = {stage: inputs.digests[stage] for stage in stages if stage in inputs.digests}
     options = deciding_options(name, dataclasses.asdict(config))
-    return {"version": VERSION, **shown, **digests, **options}
+    return {"version": VERSION, **model_shown, **digests, **options}
 
 
 def find_fresh(

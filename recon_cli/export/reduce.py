@@ -130,14 +130,14 @@ class LowerDegrees:
         low = (degree + 1) ** 2
         colored = len(splats.sh_rest)  # the others have a base colour only
         rest = torch.nn.functional.pad(splats.sh_rest, (0, 0, 0, 0, 0, len(splats) - colored))
-        whole = torch.cat([splats.sh_dc[:, None], rest], dim=1)  # [N, T, 3]
-        result = whole[:, :low].clone()
-        ridge = _RIDGE * torch.eye(low, dtype=torch.float64, device=whole.device)
+        full = torch.cat([splats.sh_dc[:, None], rest], dim=1)  # [N, T, 3]
+        result = full[:, :low].clone()
+        ridge = _RIDGE * torch.eye(low, dtype=torch.float64, device=full.device)
         ridge[0, 0] = 0
         for rows in torch.split(torch.nonzero(weight)[:, 0], _BLOCK):
             mean = products[rows, :low].double() / weight[rows, None, None]
             solved = torch.linalg.solve(
-                mean[..., :low] + ridge, mean @ whole[rows].double())
+                mean[..., :low] + ridge, mean @ full[rows].double())
             result[rows] = solved.to(result.dtype)
         home = self._splats.means.device
         return replace(self._splats, sh_dc=result[:, 0].contiguous().to(home),
@@ -145,11 +145,11 @@ class LowerDegrees:
 
     @cached_property
     def _products(self) -> tuple[Splats, Tensor, Tensor]:
-        """The scene on the device, sums of w [N], and of w Y_low^T Y [N, low, full]."""
+        """The scene on the device, sums of w [N], and of w Y_low^T Y [N, low, terms]."""
         splats = self._splats.map(lambda tensor: tensor.to(self._device))
-        full, low = (splats.sh_degree + 1) ** 2, splats.sh_degree**2  # low serves all below
+        terms, low = (splats.sh_degree + 1) ** 2, splats.sh_degree**2  # low serves all below
         total = torch.zeros(len(splats), device=self._device)
-        products = torch.zeros(len(splats), low, full, device=self._device)
+        products = torch.zeros(len(splats), low, terms, device=self._device)
         background = torch.zeros(3, dtype=splats.means.dtype, device=self._device)
         for camera in self._cameras:
             with torch.no_grad():

@@ -25,10 +25,10 @@ from recon_cli.workspace.records import ImportRecord, has_views, read_frame_list
 
 
 class ExportSource:
-    """What an export reads besides the Gaussians.
+    """The inputs of an export besides the Gaussians.
 
     A scene that was imported without views has synthetic cameras instead of them, which show
-    `splats`, the whole scene in the world of the files.
+    `splats`, the unreduced scene in the world of the files.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class ExportSource:
 
     @cached_property
     def settings(self) -> WriteSettings:
-        """What a file can say of the scene, without the options of its format."""
+        """Facts that a file can hold, without the options of its format."""
         record = ImportRecord.read(self._inputs.folders["train"])
         if record and not self.has_views:
             title = record.file

@@ -46,12 +46,12 @@ def synthetic_scene(
     or y; `max_size` is the longest side in pixels.
     """
     opaque = splats.opacities >= _OPAQUE
-    shown = opaque if bool(opaque.any()) else ~opaque
-    means = splats.means[shown].double().cpu().numpy()
+    used = opaque if bool(opaque.any()) else ~opaque
+    means = splats.means[used].double().cpu().numpy()
     middle = np.median(means, axis=0)
     radius = max(
         float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK)),
-        _WIDTHS * float(splats.scales[shown].amax(dim=1).double().median()), _LEAST_RADIUS)
+        _WIDTHS * float(splats.scales[used].amax(dim=1).double().median()), _LEAST_RADIUS)
     x_axis = np.array([1.0, 0, 0])
     y_axis = np.cross(up, x_axis)
     angles = np.pi * (0.25 + np.arange(CAMERAS_AROUND) / 2)

@@ -1,7 +1,7 @@
 """The loops over voxels, pixels and vertices that NumPy would take minutes for.
 
-They are compiled when the first mesh is made, and kept beside those of the rasterizer. What a block
-of work computes does not depend on the thread that takes it.
+They are compiled when the first mesh is made, and kept beside those of the rasterizer. The
+result of a block of work does not depend on the thread that takes it.
 """
 
 from __future__ import annotations

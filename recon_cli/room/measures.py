@@ -55,7 +55,7 @@ class Measure:
 
 @dataclass(frozen=True, eq=False)
 class RoomMeasures:
-    """What is known of a room; lengths in metres."""
+    """The measures of a room; lengths in metres."""
 
     height: Measure | None  # from floor to ceiling
     floor_area: Measure | None  # of the footprint

@@ -16,7 +16,7 @@ _TRIALS = 400  # candidates for each plane, each through one point along its nor
 _SAMPLE = 12_000  # points that candidates are scored on
 _LEAST_COSINE = 0.8  # between a plane and the normals of its points: reconstructed walls are bumpy
 _MOST_PLANES = 24
-_LEAST_SHARE = 0.015  # of the whole area; a wall of a room is some per cent, a table less
+_LEAST_SHARE = 0.015  # of the total area; a wall of a room is some per cent, a table less
 _STEPS = 8  # of the reweighted fit; it converges in about four
 
 

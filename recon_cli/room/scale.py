@@ -63,7 +63,7 @@ class Measurement:
 def parse_place(text: str, names: Collection[str]) -> Place:
     """Returns the place that a text names: a frame (with or without its suffix), point or pixel.
 
-    ConfigError if it is none of the three, or there is no such frame among `names`.
+    ConfigError if it is not one of the three, or its frame is not among `names`.
     """
     if (name := _frame(text, names)) is not None:
         return Place(name)

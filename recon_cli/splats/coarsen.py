@@ -124,8 +124,8 @@ def _match(moments: _Moments, most: int) -> tuple[Rows, Rows]:
         open_costs = np.where(free[near] & (near >= 0) & free[:, None], cost, np.inf)
         choice = open_costs.argmin(axis=1)
         best, least = near[rows, choice], open_costs[rows, choice]
-        # Each proposes to its best neighbour. What is the cheapest for both of a pair is accepted:
-        # there always is some, though neighbours need not be each other's.
+        # Each proposes to its best neighbour. A pair that is the cheapest for both is accepted:
+        # there always is one, though neighbours need not be each other's.
         proposers = np.flatnonzero(np.isfinite(least))
         if not len(proposers):
             break

@@ -20,8 +20,7 @@ from recon_cli.io.views import evenly_spread
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.splats.foreign import count_terms, drop_not_finite
-from recon_cli.splats.format import SplatFormat, WriteSettings
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.ply import is_antialiased, read_up
 from recon_cli.splats.ply_tables import Element, format_header, read_header, read_tables
 from recon_cli.splats.values import (
@@ -58,7 +57,7 @@ def write_compressed_ply(
 ) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
 
-    What lies far outside comes first: in a chunk of the room it would leave the others no bits.
+    Far outliers come first: in a chunk of the room they would leave the others no bits.
     The Gaussians of the room that fill the last chunk of these lose theirs, so they are the most
     transparent ones: small ones would show, as each is seen as large as a pixel at least.
 
@@ -147,7 +146,7 @@ def _mean_change(means: Floats, sh_rest: Floats, centers: NDArray[np.float64]) -
 
 
 def load_compressed_ply(path: Path) -> LoadedScene:
-    """Returns the scene of a compressed .ply in its order and degree, and what its comments say.
+    """Returns the scene of a compressed .ply in its order and degree, with its comments.
 
     Files without bounds of colours are supported. Gaussians that are not finite are dropped and
     harmonics of degree 4 cut, with a warning. FormatError if damaged or another kind of .ply.
@@ -220,7 +219,7 @@ def _harmonics(path: Path, tables: dict[str, NDArray[np.void]], n: int) -> Float
     names = [f"f_rest_{i}" for i in range(len(kinds))]
     if len(table) != n or set(names) != kinds.keys() or any(
             kinds[name][0] != "u1" for name in names):
-        raise FormatError(f"{path} has harmonics that do not make a degree of its Gaussians.")
+        raise FormatError(f"{path} has harmonics that do not fill a degree for its Gaussians.")
     kept = min(count_terms(path, len(names)), TERMS[-1])
     return _decode_harmonics(np.stack([table[name] for name in names], axis=1))[:, :kept]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import TERMS
-from recon_cli.splats.loaded import Origin
+from recon_cli.splats.format import Origin
 
 _MOST_BAD = 0.5  # of all rows; a file with more does not match its header
 # Fewer Gaussians, or nearly equal opacities, are not enough evidence.
@@ -123,6 +123,6 @@ def find_origin(means: NDArray[Any], log_scales: NDArray[Any]) -> Origin | None:
     size = math.exp(float(np.median(log_scales)))
     if not _ROUNDING * size < rounding < math.inf:
         return None
-    whole = np.rint(middle)
-    x, y, z = (float(value) for value in (whole if whole.any() else middle))
+    rounded = np.rint(middle)
+    x, y, z = (float(value) for value in (rounded if rounded.any() else middle))
     return Origin((x, y, z), rounding, size, rounded=means.dtype == np.float32)

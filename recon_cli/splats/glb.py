@@ -33,8 +33,7 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined, transformed
 from recon_cli.splats.axes import nearest_up
 from recon_cli.splats.foreign import drop_not_finite, warn_of_degree
-from recon_cli.splats.format import SplatFormat, WriteSettings
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     UntrustedFile,
     linear_from_srgb,
@@ -317,7 +316,7 @@ class Container(UntrustedFile):
         super().__init__(path, _MAGIC, ".glb")
         data = self.data
         if len(data) < _HEADER.size + _CHUNK.size:
-            raise FormatError(f"{path} is no .glb.")
+            raise FormatError(f"{path} is not a .glb.")
         _, version, length = _HEADER.unpack_from(data)
         if version != _VERSION:
             raise self.error(f"version {version} of the container; version 2 can be read")
@@ -357,9 +356,9 @@ class Container(UntrustedFile):
             raise self.error(
                 f"an accessor of {entry.get('type')!r:.40} and {component!r:.40}, not of {kind}")
         item, width = np.dtype(_COMPONENTS[component]), _WIDTHS[kind]
-        count = self.whole(entry, "count", 1, _LARGEST)
+        count = self.integer(entry, "count", 1, _LARGEST)
         part, stride = self._view(entry.get("bufferView"), item.itemsize * width)
-        start = self.whole(entry, "byteOffset", 0, _LARGEST, default=0)
+        start = self.integer(entry, "byteOffset", 0, _LARGEST, default=0)
         if start + stride * (count - 1) + item.itemsize * width > len(part):
             raise self.error(f"an accessor of {count} values that end after their buffer")
         table = np.ndarray((count, width), item, part, start, (stride, item.itemsize))
@@ -377,9 +376,9 @@ class Container(UntrustedFile):
         buffer = self.entry("buffers", view.get("buffer"))
         if view["buffer"] != 0 or "uri" in buffer:
             raise self.error("values in another file, or in none")
-        start = self.whole(view, "byteOffset", 0, _LARGEST, default=0)
-        length = self.whole(view, "byteLength", 1, _LARGEST)
-        stride = self.whole(view, "byteStride", least, _LARGEST, default=least)
+        start = self.integer(view, "byteOffset", 0, _LARGEST, default=0)
+        length = self.integer(view, "byteLength", 1, _LARGEST)
+        stride = self.integer(view, "byteStride", least, _LARGEST, default=least)
         if start + length > self.size:
             raise self.error(f"a view of {length} bytes that ends after the {self.size} there")
         return self._bytes[start:start + length], stride

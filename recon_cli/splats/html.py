@@ -28,8 +28,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import turn_from
-from recon_cli.splats.format import SplatFormat, WriteSettings
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_scene
 from recon_cli.splats.values import read_contents
 from recon_cli.workspace.atomic import write_bytes

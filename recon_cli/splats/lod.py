@@ -24,8 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.splats import Splats, joined, with_rows
 from recon_cli.splats.coarsen import coarsen
-from recon_cli.splats.format import SHARING, SplatFormat
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.sog import (
     META,
     Unpacked,
@@ -249,7 +248,7 @@ class _Index(UntrustedFile):
             raise self.error(f"more than {_META_LIMIT >> 20} MB")
         self._meta = self.json_object(self.data)
         # files from before version 1 do not have a number
-        self.whole(self._meta, "version", _VERSION, _VERSION, default=_VERSION)
+        self.integer(self._meta, "version", _VERSION, _VERSION, default=_VERSION)
         names = self._meta.get("filenames")
         if not isinstance(names, list) or len(names) > _FILES_LIMIT or not all(
                 isinstance(name, str) for name in names):
@@ -282,9 +281,9 @@ class _Index(UntrustedFile):
                 part = lods[min(lods, key=self._level)]
                 if not isinstance(part, dict):
                     raise self.error(f"the level {part!r:.40} of a leaf")
-                yield (self.whole(part, "file", 0, len(self.names) - 1),
-                       self.whole(part, "offset", 0, 1 << 31),
-                       self.whole(part, "count", 1, 1 << 31))
+                yield (self.integer(part, "file", 0, len(self.names) - 1),
+                       self.integer(part, "offset", 0, 1 << 31),
+                       self.integer(part, "count", 1, 1 << 31))
 
     def _level(self, name: str) -> int:
         if not name.isdecimal():

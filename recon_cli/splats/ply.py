@@ -39,8 +39,7 @@ from recon_cli.splats.foreign import (
     find_origin,
     undo_activations,
 )
-from recon_cli.splats.format import SplatFormat, WriteSettings
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.ply_tables import (
     Header,
     format_header,
@@ -260,11 +259,11 @@ def _read_colors(path: Path, table: NDArray[np.void]) -> dict[str, NDArray[np.fl
     return {name: ((table[name].astype(np.float32) / most - 0.5) / SH_C0) for name in _COLOR}
 
 
-def _without_sphere(splats: Splats, comment: tuple[int, Backdrop] | None) -> Splats:
+def _without_sphere(splats: Splats, header_backdrop: tuple[int, Backdrop] | None) -> Splats:
     """Returns splats whose last rows show a backdrop with it in place of those rows."""
-    if comment is None or comment[0] > len(splats):
+    if header_backdrop is None or header_backdrop[0] > len(splats):
         return splats
-    count, backdrop = comment
+    count, backdrop = header_backdrop
     near = splats.select(torch.arange(len(splats) - count))
     found = dataclasses.replace(near, backdrop=backdrop)
     ours = found.with_sphere().parameters()
@@ -341,7 +340,7 @@ def write_points(path: Path, splats: Splats) -> None:
 def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     """Returns positions [P, 3] and RGB colours [P, 3], None where the file has no colours.
 
-    FormatError if the file is missing, truncated, no .ply, or holds a position that is not finite.
+    FormatError if the file is missing, truncated, not a .ply, or a position is not finite.
     """
     header = read_header(path)
     first = header.elements[0]

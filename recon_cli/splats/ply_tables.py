@@ -1,7 +1,7 @@
 """The container of a .ply: its header with comments, and the tables of its elements.
 
-ASCII and both byte orders are read, and any type of number. What a header promises is compared with
-the size of the file before anything is allocated.
+ASCII and both byte orders are read, and any type of number. The promises of a header are
+compared with the size of the file before anything is allocated.
 """
 
 from __future__ import annotations

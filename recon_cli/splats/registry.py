@@ -12,8 +12,7 @@ import torch
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
-from recon_cli.splats.format import SplatFormat
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
 
 logger = logging.getLogger("recon")
@@ -22,13 +21,8 @@ FORMATS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
 
 
-def splat_file(folder: Path, name: str) -> Path:
-    """Returns the file of a scene in a folder and a format; that of lod has a folder of its own."""
-    return folder / EXPORT_FORMATS[name].file
-
-
 def format_of(path: Path) -> ExportFormat:
-    """Returns the row of a file by the end of its name; FormatError if no row has that."""
+    """Returns the row of a file by the end of its name; FormatError if there is no such row."""
     rows = [EXPORT_FORMATS[name] for name in FORMATS]
     found = [row for row in rows if row.fits_name(path.name)]
     if not found:
@@ -52,7 +46,7 @@ def read_splats(path: Path) -> Splats:
 
 
 def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:
-    """Returns the scene of a file in any of FORMATS, and what the file says of it.
+    """Returns the scene of a file in any of FORMATS, and the statements of the file about it.
 
     `axes` is a name in `axes.AXES` and wins over the axes that the file states. FormatError if it
     is damaged.

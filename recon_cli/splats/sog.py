@@ -31,8 +31,7 @@ from PIL import Image, UnidentifiedImageError
 
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
-from recon_cli.splats.format import SHARING, SplatFormat
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.values import (
     Bytes,
     Floats,
@@ -155,7 +154,7 @@ def read_files(archive: SogFiles) -> Splats:
     path, meta = archive.path, archive.meta()
     means, scales, quats, sh0 = (
         archive.part(meta, name) for name in ("means", "scales", "quats", "sh0"))
-    count = archive.whole(meta, "count", 1, _MAX_COUNT)
+    count = archive.integer(meta, "count", 1, _MAX_COUNT)
     archive.check_count(count)
     low, high = archive.numbers(means, "mins", 3, 3), archive.numbers(means, "maxs", 3, 3)
     low_name, high_name = archive.files(means, 2)
@@ -187,8 +186,8 @@ def _read_harmonics(
     if meta.get("shN") is None:
         return np.zeros((0, 0, 3), np.float32)
     part = archive.part(meta, "shN")
-    count = archive.whole(part, "count", 1, _MAX_ENTRIES + 1)
-    terms = TERMS[archive.whole(part, "bands", 1, 3)]
+    count = archive.integer(part, "count", 1, _MAX_ENTRIES + 1)
+    terms = TERMS[archive.integer(part, "bands", 1, 3)]
     entries_name, labels_name = archive.files(part, 2)
     width, lines = ROW * terms, -(-count // ROW)
     entries = archive.pixels(entries_name, width * lines, size=(width, lines))[:, :, :3]
@@ -264,7 +263,7 @@ class SogFiles(UntrustedFile):
         meta = self.json_object(self.read(META, _META_LIMIT))
         if "version" not in meta and isinstance(meta.get("means"), dict):
             raise self.error("version 1 of the format, which is not supported")
-        if self.whole(meta, "version", 0, sys.maxsize) != 2:
+        if self.integer(meta, "version", 0, sys.maxsize) != 2:
             raise self.error(f"version {meta['version']} of the format; version 2 can be read")
         return meta
 
@@ -336,11 +335,11 @@ class Archive(SogFiles):
         super().__init__(path, _START, ".sog")
         self.size = len(self.data)
         if self.data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
-            raise self.error(f"more than {_ENTRIES} entries: no .sog")
+            raise self.error(f"more than {_ENTRIES} entries, which is not a .sog")
         try:
             self._zip = zipfile.ZipFile(io.BytesIO(self.data))
         except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-            raise self.error(f"a zip that is no .sog: {error}") from error
+            raise self.error(f"a zip that is not a .sog: {error}") from error
         self._entries = {entry.filename: entry for entry in self._zip.infolist()}
         if len(self._entries) < len(self._zip.infolist()):
             raise self.error("two entries of one name")
@@ -358,11 +357,11 @@ class Archive(SogFiles):
         try:
             with self._zip.open(entry) as file:
                 data = file.read(most + 1)
-                whole = len(data) <= most and not file.read(1)
+                complete = len(data) <= most and not file.read(1)
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError,
                 NotImplementedError) as error:
             raise self.error(f"the entry {name}, which cannot be unpacked: {error}") from error
-        if not whole:
+        if not complete:
             raise self.error(f"the entry {name}, which unpacks to more than {most} bytes")
         return data
 

@@ -15,8 +15,7 @@ import numpy as np
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.splats.foreign import drop_not_finite
-from recon_cli.splats.format import SplatFormat
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.values import (
     decode_opacities,
     encode_opacities,

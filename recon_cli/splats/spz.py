@@ -32,8 +32,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.splats.axes import AXES, PLY, Z_UP, nearest_up, turn_from, up_of
 from recon_cli.splats.foreign import warn_of_degree
-from recon_cli.splats.format import SplatFormat, WriteSettings
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     Bytes,
     Floats,

@@ -19,7 +19,7 @@ from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.splats.axes import AXES
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene
 from recon_cli.splats.ply import write_ply
 from recon_cli.splats.registry import format_of, load_splats
 from recon_cli.train.train_data import write_config

@@ -35,7 +35,7 @@ def max_loss_db(name: str, options: Mapping[str, Any]) -> float:
 
 
 def deciding_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the options of export that decide what a file of a format holds, as JSON values."""
+    """Returns the options of export that decide on the files of a format, as JSON values."""
     names = _FRAME if EXPORT_FORMATS[name].kind == "cameras" else _SCENE
     chosen = {key: options[key] for key in names} | own_options(name, options)
     return {key: list(value) if isinstance(value, tuple) else value

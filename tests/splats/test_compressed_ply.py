@@ -154,19 +154,19 @@ def test_what_does_not_fit_is_refused_and_tiny_scales_are_clamped(tmp_path):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (lambda _: b"", "no .ply"),
+    (lambda _: b"", "not a .ply"),
     (lambda data: data[:-1], "truncated"),
     (lambda data: data + b"1", "truncated or damaged"),
     (lambda data: data.replace(b"vertex 9", b"vertex 9000000000"), "truncated"),
     (lambda data: data.replace(b"chunk 1", b"chunk 2").replace(b"end_header\n", (
         b"end_header\n" + bytes(72))), "2 chunks of 256 for 9"),
-    (lambda data: data.replace(b"packed_scale", b"scale"), "no compressed"),
-    (lambda data: data.replace(b"min_y", b"min_w"), "no compressed"),
-    (lambda data: data.replace(b"min_g", b"min_q"), "no compressed"),
-    (lambda data: data.replace(b"uint packed_scale", b"float packed_scale"), "no compressed"),
-    (lambda data: data.replace(b"sh 9", b"sh 8")[:-9], "do not make a degree"),
-    (lambda data: data.replace(b"uchar f_rest_8", b"char f_rest_8"), "do not make a degree"),
-    (lambda data: data.replace(b"f_rest_8", b"f_rest_9"), "do not make a degree"),
+    (lambda data: data.replace(b"packed_scale", b"scale"), "not a compressed"),
+    (lambda data: data.replace(b"min_y", b"min_w"), "not a compressed"),
+    (lambda data: data.replace(b"min_g", b"min_q"), "not a compressed"),
+    (lambda data: data.replace(b"uint packed_scale", b"float packed_scale"), "not a compressed"),
+    (lambda data: data.replace(b"sh 9", b"sh 8")[:-9], "do not fill a degree"),
+    (lambda data: data.replace(b"uchar f_rest_8", b"char f_rest_8"), "do not fill a degree"),
+    (lambda data: data.replace(b"f_rest_8", b"f_rest_9"), "do not fill a degree"),
     (lambda data: data.replace(b"binary_little_endian", b"ascii"), "truncated or damaged"),
     (lambda data: data.replace(b"end_header\n", b"end_header\n" + b"\xff" * 4, 1)[:-4],
      "not finite in means"),

@@ -55,19 +55,19 @@ def of(value, group, name):
 
 
 @pytest.mark.parametrize(("data", "said"), [
-    (b"", "no .glb"), (b"glTF", "no .glb"), (b"PK\x03\x04" + bytes(50), "no .glb"),
+    (b"", "not a .glb"), (b"glTF", "not a .glb"), (b"PK\x03\x04" + bytes(50), "not a .glb"),
     (struct.pack("<4sIIII", b"glTF", 1, 20, 0, 0), "version 1"),
     (head(1 << 31, (b"JSON", b"{} ")), "header promises 2147483648"),
     (head(10, (b"JSON", b"{} ")), "header promises 10"),
     (head(None, (b"BIN\0", b"{} ")), "needed is JSON"),
     (head(None, (b"JSON", b"{}  "), (b"JSON", b"{}  ")), "needed is BIN"),
-    (head(None, (b"JSON", b"[]  ")), "it is no object"),
+    (head(None, (b"JSON", b"[]  ")), "not an object"),
     (head(None, (b"JSON", b"{}  ")), "no scenes 0"),
     (head(None, (b"JSON", b"{")), "cannot be read"),
     (head(None, (b"JSON", b"\xff\xff")), "cannot be read"),
     (head(None, (b"JSON", b"[" * 100_000)), "cannot be read"),
     (head(None, (b"JSON", b'{"a":' * 100_000)), "cannot be read"),
-    (head(None, (b"JSON", b'{"a":NaN}')), "NaN is no number"),
+    (head(None, (b"JSON", b'{"a":NaN}')), "NaN is not a number"),
     (head(None, (b"JSON", b"9" * 5000)), "cannot be read"),
     (head(None, (b"JSON", b"[" + b"{}," * 2_000_000 + b"0]")), "6000003 bytes, needed is JSON"),
     (struct.pack("<4sIII4s", b"glTF", 2, 20, 1 << 31, b"JSON"), "ends after the file"),

@@ -231,11 +231,11 @@ def with_scene(make):
     (lambda text: re.sub('data-bytes="[0-9]+"', 'data-bytes="999999999999"', text),
      "999999999999 bytes, but holds"),
     (with_scene(lambda scene: scene[:-8]), "promises a scene of"),
-    (with_scene(lambda scene: scene[:-2]), "no base64"),
-    (with_scene(lambda scene: "*" + scene[1:]), "no base64"),
-    (with_scene(lambda scene: scene[:40] + "\n" + scene[40:]), "no base64"),
+    (with_scene(lambda scene: scene[:-2]), "not base64"),
+    (with_scene(lambda scene: "*" + scene[1:]), "not base64"),
+    (with_scene(lambda scene: scene[:40] + "\n" + scene[40:]), "not base64"),
     (with_scene(lambda scene: base64.b64encode(
-        b"PK" + base64.b64decode(scene)[2:]).decode()), "no SPZ"),
+        b"PK" + base64.b64decode(scene)[2:]).decode()), "not an SPZ"),
 ])
 def test_damaged_and_lying_pages_are_refused_with_the_reason(written, change, message):
     written.write_text(change(written.read_text(encoding="utf-8")), encoding="utf-8")

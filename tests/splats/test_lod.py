@@ -154,9 +154,9 @@ DAMAGES = {
     "a range beyond the file": lambda meta: _first_leaf(meta).update(count=2**31),
     "a range twice": lambda meta: leaves(meta["tree"])[1]["lods"].update({"0": _first_leaf(meta)}),
     "no count": lambda meta: _first_leaf(meta).pop("count"),
-    "a level that is no number": lambda meta: leaves(meta["tree"])[0].update(lods={"fine": {}}),
-    "children that are no list": lambda meta: meta["tree"].update(children={}),
-    "a child that is no node": lambda meta: meta["tree"]["children"].append(3),
+    "a level that is not a number": lambda meta: leaves(meta["tree"])[0].update(lods={"fine": {}}),
+    "children that are not a list": lambda meta: meta["tree"].update(children={}),
+    "a child that is not a node": lambda meta: meta["tree"]["children"].append(3),
     "a tree without leaves": lambda meta: meta.update(tree={}),
 }
 
