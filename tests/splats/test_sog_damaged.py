@@ -150,7 +150,7 @@ def test_a_missing_entry_is_refused(tmp_path, good, name):
     ("means_l.webp", claimed(1000, 1000), "needed are 1000x1000|not an image"),
     ("shN_centroids.webp", plain(64 * 8, 1), "512x1 pixels for 960"),
     ("shN_centroids.webp", plain(64 * 15, 2), "960x2 pixels, needed are 960x1"),
-    ("sh0.webp", b"RIFF1234WEBPVP8Lxxxx", "not an image"), ("sh0.webp", b"", "no image"),
+    ("sh0.webp", b"RIFF1234WEBPVP8Lxxxx", "not an image"), ("sh0.webp", b"", "not an image"),
     ("sh0.webp", b"GIF89a" + bytes(20), "not an image"),
     ("quats.webp", plain(9, 8, 4), "without their greatest"),
     ("shN_labels.webp", plain(9, 8, 3, 255), "label 65535 of a palette"),
