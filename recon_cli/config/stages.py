@@ -8,6 +8,7 @@ from pathlib import Path
 from recon_cli.config.fields import StageConfig, option
 from recon_cli.errors import ConfigError
 from recon_cli.workspace.atomic import read_json
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, describe_max_loss
 
 SCALE_BETWEEN = (
     "Set the scale: A and B are METRES apart. Each is a frame name (its camera), x,y,z (a point of "
@@ -333,12 +334,6 @@ class EvaluateConfig(StageConfig):
         True, "Measure where the scene can be trusted, and list what is poorly seen.")
 
 
-PLAN = "plan.svg"
-MESH_FORMATS = ("mesh.ply", "mesh.glb", "mesh.obj", PLAN)
-EXPORT_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html", "lod",
-                  "points.ply", "colmap", "transforms.json", *MESH_FORMATS)
-
-
 def read_matrix(path: str) -> list[float]:
     """Returns the 16 numbers of a JSON file with 4 rows of 4 numbers, row by row."""
     rows = read_json(Path(path))
@@ -395,7 +390,7 @@ class ExportConfig(StageConfig):
         per_file=True)
     max_loss: float | None = option(
         None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
-        per_file=True, automatic="0.3; 3 for .splat, which has no harmonics")
+        per_file=True, automatic=describe_max_loss())
     max_triangles: int = option(
         300_000, "Maximum number of triangles of a mesh.", minimum=4, per_file=True)
     voxel: float | None = option(

@@ -11,7 +11,7 @@ _BULK = (0.05, 0.95)  # quantiles along each axis, between which the bulk lies
 
 
 def describe_bounds(splats: Splats) -> str:
-    """Returns what to know of a scene that reaches much farther than its bulk; empty otherwise."""
+    """Returns a warning about a scene that reaches much farther than its bulk; else empty."""
     means = splats.means.detach().double().cpu()
     # torch.quantile takes 16 million values at most
     order = means.sort(dim=0).values
@@ -26,7 +26,7 @@ def describe_bounds(splats: Splats) -> str:
     if splats.backdrop is not None:
         text += f" --drop-backdrop leaves out the sphere behind them ({alone:,.4g} units are left)."
     if alone > _FAR * bulk:
-        text += " --crop cuts off what lies outside a box."
+        text += " --crop cuts off everything outside a box."
     return text
 
 

@@ -1,8 +1,8 @@
-"""Removal of floaters, by what the training views show of each Gaussian, and of islands.
+"""Removal of floaters, as the training views show them, and of islands.
 
 There are three kinds of floaters. *Unseen*: no view blends it with more than a tiny weight
 (RadSplat, Niemeyer et al. 2024, prunes by the same maximum). *In front*: at most two views see it,
-and in each it is less than half way to what is behind it: it was fitted to these views alone.
+and in each it is less than half way to the surface behind it: it was fitted to these views alone.
 *Harmful*: without it the views would be rendered better. That is exact for each Gaussian alone,
 since colour is affine in its alpha: with d = alpha T (c - B) its contribution to a pixel and e the
 error there, removing it changes the squared error by sum ||d||^2 - 2 sum e d. The first sum is
@@ -33,8 +33,6 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
 from recon_cli.render import RenderOutput, render
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.scene import Scene
-from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 
@@ -48,7 +46,7 @@ _VISIBLE = 1 / 255  # fainter ones are not rendered, and touch nothing
 # Measurements behind these constants: tests/bench/notes/scenes.md.
 _WEIGHT = 0.01  # alpha T; below, a view does not show it. RadSplat's threshold for high quality
 _FEW = 2  # views
-_IN_FRONT = 0.5  # of the depth of what is behind
+_IN_FRONT = 0.5  # of the depth of the surface behind
 _SOLID = 0.5  # coverage from which something counts as behind
 _HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
 _WORST = 0.2  # of the greatest harm: the threshold of a round
@@ -73,16 +71,14 @@ def drop_floaters(splats: Splats, views: Sequence[TrainView], ctx: StageContext)
 
 
 def drop_islands(
-    splats: Splats, scene: Scene, similarity: Similarity, views: Sequence[TrainView] | None,
+    splats: Splats, room: tuple[list[float], float], views: Sequence[TrainView] | None,
     ctx: StageContext,
 ) -> Splats:
     """Returns a scene without small groups of Gaussians far from all others.
 
-    `scene` has the extent of the room in the world of the training, from which `similarity` leads
-    to that of `splats` and of the training views (None if there are none).
+    `room` is its middle [3] and radius; `views` are the training views, None if there are none.
     """
-    center = similarity.points(scene.center).tolist()
-    near = splats.within(center, similarity.scale * scene.reach)
+    near = splats.within(*room)
     visible = None
     if views is not None:
         on_device = splats.map(lambda tensor: tensor.to(ctx.device))
@@ -94,7 +90,7 @@ def _drop(splats: Splats, removed: Tensor, option: str) -> Splats:
     remaining = ~removed.cpu()
     if not torch.any(remaining):
         raise ConfigError(
-            f"{option} would leave nothing of {len(splats):,} Gaussians.",
+            f"{option} would remove all {len(splats):,} Gaussians.",
             hint="Check that the views show the scene: `recon render --views train`.")
     return splats.select(remaining)
 
@@ -214,7 +210,7 @@ def _find_in_front(
 
 
 def _is_before(means: Tensor, camera: Camera, behind: RenderOutput) -> Tensor:
-    """Returns which centres [K, 3] are far in front of what a render shows, [K] bool."""
+    """Returns which centres [K, 3] are far in front of a rendered surface, [K] bool."""
     viewmat = torch.from_numpy(camera.viewmat).to(means)
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(dim=1)
     ahead = z.clamp_min(1e-6)
@@ -227,9 +223,9 @@ def _is_before(means: Tensor, camera: Camera, behind: RenderOutput) -> Tensor:
 def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor:
     """Returns which Gaussians belong to islands, [N] bool.
 
-    `near` [N] are those near enough to be islands, `visible` [N] what a training view shows, None
-    if unknown. Groups outside the box of the scene that a view shows, through a window, are no
-    islands.
+    `near` [N] are those near enough to be islands, `visible` [N] those that a training view shows,
+    None if unknown. Groups outside the box of the scene that a view shows, through a window, are
+    not islands.
     """
     drawn = (near & (splats.opacities >= _VISIBLE)).cpu()
     rows = torch.nonzero(drawn)[:, 0]
@@ -284,7 +280,7 @@ def _deviations_along(
 def _find_far_groups(
     means: NDArray[np.float64], group: NDArray[np.int64], main: int
 ) -> NDArray[np.bool_]:
-    """Returns for each group whether all of it is far from the main one."""
+    """Returns for each group whether it lies completely apart from the main one."""
     scene = means[group == main]
     middle = np.median(scene, axis=0)
     radius = np.quantile(np.linalg.norm(scene - middle, axis=1), _BULK)

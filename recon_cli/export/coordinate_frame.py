@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.config.stages import PLAN, ExportConfig
+from recon_cli.config.stages import ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
@@ -16,10 +16,10 @@ from recon_cli.room.measures import RoomFrame
 from recon_cli.room.scale import ARBITRARY, MEASURED, Measurement, ScaleBetween, measure
 from recon_cli.scene.gravity import camera_up, find_gravity, turn_onto
 from recon_cli.scene.similarity import Similarity
+from recon_cli.splats.axes import UP
+from recon_cli.workspace.export_formats import PLAN
 from recon_cli.workspace.records import ImportRecord, has_views
 from recon_cli.workspace.summaries import WorldSummary
-
-_UP = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 
 _RIGID = 1e-6  # difference of a scale from 1
 # Relative error of --scale-between with two pixels: the depth of a pick in the middle was 0.5% and
@@ -33,7 +33,7 @@ logger = logging.getLogger("recon")
 class ExportFrame:
     """The coordinate frame of the exported files."""
 
-    similarity: Similarity  # to it from the world of the training
+    similarity: Similarity  # from the world of the training to this frame
     up: NDArray[np.float64]  # [3] unit vector in it; the mean up of the cameras if up was not found
     measurement: Measurement | None  # that gave the scale; None if nothing was measured
 
@@ -41,13 +41,13 @@ class ExportFrame:
 def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
     """Returns the coordinate frame that the options select.
 
-    ConfigError if --scale-between names no place, or --transform is no similarity.
+    ConfigError if --scale-between does not name a place, or --transform is not a similarity.
     """
     measurement = _measure_scale(config, inputs)
     similarity = Similarity(scale=measurement.scale) if measurement else Similarity()
     up = _find_up(inputs, warn=config.up is not None)
     if config.up is not None:
-        similarity = Similarity(rotation=turn_onto(up, np.array(_UP[config.up]))).after(similarity)
+        similarity = Similarity(rotation=turn_onto(up, np.array(UP[config.up]))).after(similarity)
     if config.transform is not None:
         try:
             transform = Similarity.from_matrix(np.array(config.transform).reshape(4, 4))
@@ -61,7 +61,7 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
 
 
 def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
-    """Returns what measures need; StageError if scale or up is not known, for none is guessed."""
+    """Returns the frame for measures; StageError if scale or up is unknown: none is guessed."""
     world = WorldSummary.read(inputs.folders["sfm"])
     source = world.evidence.scale_source if world else ARBITRARY
     if frame.measurement is None and source == ARBITRARY:
@@ -71,12 +71,13 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
     scale = frame.similarity.scale / (frame.measurement.scale if frame.measurement else 1.0)
     if abs(scale - 1) > _RIGID:
         raise StageError(
-            f"{PLAN} cannot be measured: after --transform one unit is no metre.",
+            f"{PLAN} cannot be measured: --transform changes the scale, so units are no longer "
+            "metres.",
             hint="Leave out the scale of --transform.")
     picked = frame.measurement is not None or source == MEASURED
     error = _PICKED_SCALE_ERROR if picked else 0.0
     if world and world.evidence.up_found:
-        return RoomFrame(frame.similarity.rotation @ np.array(_UP["z"]), error)
+        return RoomFrame(frame.similarity.rotation @ np.array(UP["z"]), error)
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
     points, _ = read_points(sparse / "points3D.bin")
     gravity = find_gravity(
@@ -104,7 +105,7 @@ def _find_up(inputs: StageInputs, *, warn: bool) -> NDArray[np.float64]:
         return record.up()
     world = WorldSummary.read(inputs.folders["sfm"])
     if world and world.evidence.up_found:
-        return np.array(_UP["z"])
+        return np.array(UP["z"])
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
     viewmats = np.stack([viewmat for _, _, viewmat in read_images(sparse / "images.bin")])
     if warn:

@@ -1,6 +1,6 @@
 """Alignment of an imported scene with the cameras of the workspace.
 
-A scene in another frame renders without complaint, and every score of it is wrong. So some training
+A scene in another frame renders without complaint, and all its scores are wrong. So some training
 views are rendered and compared with their images, and with flat images in their mean colours.
 """
 
@@ -45,10 +45,10 @@ class Alignment:
         """Why the frame may be wrong, as a sentence; empty if it fits."""
         above = self.psnr_db[self.frame] - self.flat_db
         if not above >= _EVIDENT:  # a NaN too
-            return (f"the imported scene does not show what the views show: {self}. It is in "
-                    "another frame than the cameras, and no score of it means anything")
+            return (f"the imported scene does not match the views: {self}. It is in "
+                    "another frame than the cameras, and its scores mean nothing")
         if above < _DOUBTFUL:
-            return (f"the imported scene hardly shows what the views show: {self}. It is a poor "
+            return (f"the imported scene hardly matches the views: {self}. It is a poor "
                     "one, or its frame differs a little from that of the cameras")
         return ""
 

@@ -1,4 +1,4 @@
-"""What an export leaves in its folder: the files of an earlier one that it does not write again.
+"""Files of an earlier export that a new one leaves in its folder.
 
 They are hard links to those of the result that is replaced, made last, so that nothing writes
 through them. Each is fresh or stale by its own record. A file that the user put there or changed
@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recon_cli.config.stages import EXPORT_FORMATS, ExportConfig
+from recon_cli.config.stages import ExportConfig
 from recon_cli.context import EarlierResult, StageInputs
 from recon_cli.errors import ManifestError
 from recon_cli.workspace.atomic import LEFTOVERS
 from recon_cli.workspace.digests import matches
+from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.export_record import (
-    CAMERA_FORMATS,
     VERSION,
     ExportedFile,
     ExportSummary,
@@ -40,7 +40,7 @@ _CHANGED, _MISSING = "it was changed by hand", "some of its files are missing"
 
 @dataclass(frozen=True)
 class KeptFiles:
-    """What is kept of an earlier export."""
+    """The files that are kept of an earlier export."""
 
     files: Mapping[str, ExportedFile]  # by format
     own_files: tuple[str, ...]  # relative paths of those that the user made or changed
@@ -56,21 +56,13 @@ def read_records(
         return {}
     try:
         files = ExportSummary.from_json(earlier.summary).files or {}
-    except ManifestError:  # of another version, or damaged: what the files were made of is unknown
-        files = {name: ExportedFile(file=path) for name in EXPORT_FORMATS if name != "ply"
-                 if (path := _find_file(earlier, name))}
+    except ManifestError:  # of another version, or damaged: the sources of the files are unknown
+        files = {name: ExportedFile(file=row.file) for name, row in EXPORT_FORMATS.items()
+                 if name != "ply"}
     return {
         name: dataclasses.replace(record, stale=_find_reason(name, record, config, inputs, model))
-        for name, record in files.items()
-        if (earlier.folder / main_file(name, record.file)).exists()}
-
-
-def _find_file(earlier: EarlierResult, name: str) -> str | None:
-    """Returns the file of a format in a folder without records, or None."""
-    usual = {"colmap": "sparse/0", "lod": "lod/lod-meta.json"}
-    bare = name.startswith("mesh.") or name in ("points.ply", "transforms.json", "plan.svg")
-    path = usual.get(name, name if bare else f"splats.{name}")
-    return path if (earlier.folder / main_file(name, path)).exists() else None
+        for name, record in files.items() if name in EXPORT_FORMATS
+        and (earlier.folder / main_file(name, record.file)).exists()}
 
 
 def _find_reason(
@@ -91,14 +83,15 @@ def _find_reason(
 def made_of(
     name: str, config: ExportConfig, inputs: StageInputs, model: str
 ) -> dict[str, Any]:
-    """Returns what a file of a format is made of now, as JSON values."""
+    """Returns what a file of a format would be made of now, as JSON values."""
     stages = ["ingest", "sfm"]
-    if name not in CAMERA_FORMATS:
+    model_shown = {}
+    if EXPORT_FORMATS[name].kind != "cameras":
         stages += ["train", "prune"] if model == "pruned" else ["train"]
+        model_shown = {"model": model}
     digests = {stage: inputs.digests[stage] for stage in stages if stage in inputs.digests}
-    shown = {} if name in CAMERA_FORMATS else {"model": model}
     options = deciding_options(name, dataclasses.asdict(config))
-    return {"version": VERSION, **shown, **digests, **options}
+    return {"version": VERSION, **model_shown, **digests, **options}
 
 
 def find_fresh(
@@ -113,7 +106,7 @@ def find_fresh(
 
 
 def discard_files(out: Path, name: str, written: Collection[str]) -> None:
-    """Removes what was written of a format that failed, and of no other one."""
+    """Removes the files of a format that failed, and of no other one."""
     for path in list(_files_below(out)):
         relative = path.relative_to(out).as_posix()
         if owns(name, relative) and not any(owns(other, relative) for other in written):
@@ -124,7 +117,7 @@ def keep_files(
     out: Path, earlier: EarlierResult | None, records: Mapping[str, ExportedFile],
     written: Collection[str],
 ) -> KeptFiles:
-    """Puts into `out` what it lacks of the earlier export, without the formats now written."""
+    """Puts the files of the earlier export into `out`, without the formats now written."""
     kept = {name: record for name, record in records.items() if name not in written}
     own_files: list[str] = []
     renamed: dict[str, str] = {}

@@ -5,31 +5,82 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 
+from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
+from recon_cli.export.cleanup import drop_floaters, drop_islands
+from recon_cli.export.source import ExportSource
+from recon_cli.io.images import fit_camera
+from recon_cli.io.views import evenly_spread
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.prune_loop import survivors
 from recon_cli.workspace.export_record import ExportChange
 
 Box = tuple[float, float, float, float, float, float]  # x, y, z of the lowest corner, the highest
 
-_RIDGE = 1e-3  # keeps coefficients small that no view tells apart, such as of a wall seen head-on
+_COLOR_SIZE, _COLOR_VIEWS = 400, 100  # pixels and views, at most, that colours are fitted to
+_SCORE = "loo"  # which Gaussians --max-mb keeps; docs/pruning.md
+_RIDGE = 1e-3  # keeps coefficients small that no view can separate, such as of a wall seen head-on
 _BLOCK = 1 << 16  # Gaussians that are solved for at once
 _SHRINK = 0.99  # of the count at most, from one attempt to the next
 
 logger = logging.getLogger("recon")
 
 
+def reduce_scene(
+    splats: Splats, config: ExportConfig, source: ExportSource, size_of: Callable[[Splats], int]
+) -> tuple[Splats, list[ExportChange]]:
+    """Returns the scene after the options that remove something, in order, and the changes.
+
+    Floaters and islands come before --crop: it removes the background.
+    `size_of` measures the file that --max-mb limits. ConfigError if nothing would be left.
+    """
+    changes: list[ExportChange] = []
+
+    def step(option: str, after: Splats) -> Splats:
+        changes.append(measure_change(option, splats, after, source.psnr.psnr_db))
+        return after
+
+    if config.drop_floaters:
+        splats = step("drop_floaters", drop_floaters(splats, source.load_training(), source.ctx))
+    if config.drop_islands:
+        views = source.load_training() if source.has_views else None
+        splats = step("drop_islands", drop_islands(splats, source.room, views, source.ctx))
+    if config.drop_backdrop:
+        splats = step("drop_backdrop", replace(splats, backdrop=None))
+    if config.crop is not None:
+        splats = step("crop", crop(splats, config.crop))
+    if config.sh_degree is not None and config.sh_degree < splats.sh_degree:
+        splats = step("sh_degree", lower_degrees(splats, source).at(config.sh_degree))
+    if config.max_mb is not None:
+        splats = step("max_mb", fit_to_size(
+            splats, int(1e6 * config.max_mb), size_of=size_of,
+            score_of=partial(_score, source=source), at_degree=lower_degrees(splats, source).at,
+            psnr_db=source.psnr.psnr_db))
+    return splats, changes
+
+
+def _score(splats: Splats, *, source: ExportSource) -> Tensor:
+    """Returns how much each Gaussian matters to the training views, [N]."""
+    on_device = splats.map(lambda tensor: tensor.to(source.ctx.device))
+    importance = Importance.of_score(_SCORE, len(on_device), on_device.means.device)
+    add_views(importance, on_device, source.load_training(),
+              sh_degree=on_device.sh_degree, backend=source.ctx.backend)
+    return importance.score(_SCORE, on_device, beta=0.0, generator=torch.Generator()).cpu()
+
+
 def measure_change(
     option: str, before: Splats, after: Splats, psnr_db: Callable[[Splats], float]
 ) -> ExportChange:
-    """Returns and logs what an option has removed."""
+    """Returns and logs how many Gaussians and dB an option has removed."""
     change = ExportChange(
         option=option, gaussians=len(after), gaussians_before=len(before),
         degree=after.sh_degree, degree_before=before.sh_degree,
@@ -56,54 +107,72 @@ def crop(splats: Splats, box: Box) -> Splats:
 
 
 class LowerDegrees:
-    """A scene in lower degrees of spherical harmonics, fitted to what the views see of its colours.
+    """A scene in lower degrees of spherical harmonics, fitted to the colours that the views see.
 
     Cutting the higher coefficients off changes all colours: a Gaussian that is seen from one side
     only owes its colour there to all of them together. The lower ones y are instead the least
     squares of w |Y_low(d) y - Y(d) x|^2 over the views, with directions d to the Gaussian and its
-    blend weights w in them. What no view sees is cut.
+    blend weights w in them. Gaussians that no view sees are cut.
     """
 
-    def __init__(self, splats: Splats, cameras: Sequence[Camera], *, backend: str) -> None:
-        self._splats, full = splats, (splats.sh_degree + 1) ** 2
-        low = splats.sh_degree**2  # of the next lower degree, whose part serves those below
-        device = splats.means.device
-        self._weight = torch.zeros(len(splats), device=device)
-        self._products = torch.zeros(len(splats), low, full, device=device)
-        background = torch.zeros(3, dtype=splats.means.dtype, device=device)
-        for camera in cameras:
-            with torch.no_grad():
-                weight = render(splats, camera, background, 0, backend=backend,
-                                scores=True).statistics.blend_sum.float()
-            seen = torch.nonzero(weight)[:, 0]
-            center = torch.as_tensor(camera.center, dtype=torch.float32, device=device)
-            away = torch.nn.functional.normalize(splats.means[seen].float() - center, dim=1)
-            basis = torch.cat([
-                torch.full((len(seen), 1), SH_C0, device=device),
-                basis_rest(away, splats.sh_degree)], dim=1)
-            weighted = weight[seen, None] * basis[:, :low]
-            self._weight.index_add_(0, seen, weight[seen])
-            self._products.index_add_(0, seen, weighted[:, :, None] * basis[:, None])
+    def __init__(
+        self, splats: Splats, cameras: Sequence[Camera], *, backend: str,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self._splats, self._cameras, self._backend = splats, cameras, backend
+        self._device = torch.device(device)
 
     def at(self, degree: int) -> Splats:
         """Returns the scene in a degree below its own; in its own it is unchanged."""
-        splats = self._splats
-        if degree >= splats.sh_degree:
-            return splats
+        if degree >= self._splats.sh_degree:
+            return self._splats
+        splats, weight, products = self._products
         low = (degree + 1) ** 2
         colored = len(splats.sh_rest)  # the others have a base colour only
         rest = torch.nn.functional.pad(splats.sh_rest, (0, 0, 0, 0, 0, len(splats) - colored))
-        whole = torch.cat([splats.sh_dc[:, None], rest], dim=1)  # [N, T, 3]
-        result = whole[:, :low].clone()
-        ridge = _RIDGE * torch.eye(low, dtype=torch.float64, device=whole.device)
+        full = torch.cat([splats.sh_dc[:, None], rest], dim=1)  # [N, T, 3]
+        result = full[:, :low].clone()
+        ridge = _RIDGE * torch.eye(low, dtype=torch.float64, device=full.device)
         ridge[0, 0] = 0
-        for rows in torch.split(torch.nonzero(self._weight)[:, 0], _BLOCK):
-            products = self._products[rows, :low].double() / self._weight[rows, None, None]
-            wanted = products @ whole[rows].double()
-            solved = torch.linalg.solve(products[..., :low] + ridge, wanted)
+        for rows in torch.split(torch.nonzero(weight)[:, 0], _BLOCK):
+            mean = products[rows, :low].double() / weight[rows, None, None]
+            solved = torch.linalg.solve(
+                mean[..., :low] + ridge, mean @ full[rows].double())
             result[rows] = solved.to(result.dtype)
-        return replace(splats, sh_dc=result[:, 0].contiguous(),
-                       sh_rest=result[:colored, 1:].contiguous())
+        home = self._splats.means.device
+        return replace(self._splats, sh_dc=result[:, 0].contiguous().to(home),
+                       sh_rest=result[:colored, 1:].contiguous().to(home))
+
+    @cached_property
+    def _products(self) -> tuple[Splats, Tensor, Tensor]:
+        """The scene on the device, sums of w [N], and of w Y_low^T Y [N, low, terms]."""
+        splats = self._splats.map(lambda tensor: tensor.to(self._device))
+        terms, low = (splats.sh_degree + 1) ** 2, splats.sh_degree**2  # low serves all below
+        total = torch.zeros(len(splats), device=self._device)
+        products = torch.zeros(len(splats), low, terms, device=self._device)
+        background = torch.zeros(3, dtype=splats.means.dtype, device=self._device)
+        for camera in self._cameras:
+            with torch.no_grad():
+                weight = render(splats, camera, background, 0, backend=self._backend,
+                                scores=True).statistics.blend_sum.float()
+            seen = torch.nonzero(weight)[:, 0]
+            center = torch.as_tensor(camera.center, dtype=torch.float32, device=self._device)
+            away = torch.nn.functional.normalize(splats.means[seen].float() - center, dim=1)
+            basis = torch.cat([
+                torch.full((len(seen), 1), SH_C0, device=self._device),
+                basis_rest(away, splats.sh_degree)], dim=1)
+            weighted = weight[seen, None] * basis[:, :low]
+            total.index_add_(0, seen, weight[seen])
+            products.index_add_(0, seen, weighted[:, :, None] * basis[:, None])
+        return splats, total, products
+
+
+def lower_degrees(splats: Splats, source: ExportSource) -> LowerDegrees:
+    """Returns a scene in lower degrees, as the training views see it."""
+    cameras = [fit_camera(source.frame.similarity.camera(view.camera), _COLOR_SIZE)
+               for view in evenly_spread(source.scene.train, _COLOR_VIEWS)]
+    return LowerDegrees(
+        splats, cameras, backend=source.ctx.backend, device=source.ctx.device)
 
 
 def fit_to_size(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,7 @@ CAMERAS_AROUND = 4  # cameras outside, and as many inside
 _BULK = 0.9  # of the opaque Gaussians lie within the radius; far ones behind windows do not count
 _OPAQUE = 0.5
 _WIDTHS = 3.0  # standard deviations that a radius has at least: centres alone may all be one
-_LEAST_RADIUS = NEAR  # else what is in the middle is too near to be drawn
+_LEAST_RADIUS = NEAR  # else Gaussians in the middle are too near to be drawn
 _DISTANCE = 2.5  # radii: the bulk and some space around it fill a field of view of 60 degrees
 _HEIGHT = 0.6  # radii, of the cameras outside
 _INSIDE = 0.6  # radii from the middle, within which the emptiest position is searched
@@ -45,12 +46,12 @@ def synthetic_scene(
     or y; `max_size` is the longest side in pixels.
     """
     opaque = splats.opacities >= _OPAQUE
-    shown = opaque if bool(opaque.any()) else ~opaque
-    means = splats.means[shown].double().cpu().numpy()
+    used = opaque if bool(opaque.any()) else ~opaque
+    means = splats.means[used].double().cpu().numpy()
     middle = np.median(means, axis=0)
     radius = max(
         float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK)),
-        _WIDTHS * float(splats.scales[shown].amax(dim=1).double().median()), _LEAST_RADIUS)
+        _WIDTHS * float(splats.scales[used].amax(dim=1).double().median()), _LEAST_RADIUS)
     x_axis = np.array([1.0, 0, 0])
     y_axis = np.cross(up, x_axis)
     angles = np.pi * (0.25 + np.arange(CAMERAS_AROUND) / 2)
@@ -84,20 +85,20 @@ def _find_emptiest(
 
 @dataclass(frozen=True, eq=False)
 class SelfPsnr:
-    """PSNR of a changed scene against renders of the whole one, on the scale of photos.
+    """PSNR of a changed scene against renders of the original, on the scale of photos.
 
     It is that of a scene that shows photos at ASSUMED_DB: the error there and the difference to the
     renders add up as variances do. Only pixels that show something count.
     """
 
-    # cameras, what the whole scene shows there, [H, W, 3] in [0, 1], and where, [H, W]
+    # cameras, renders of the complete scene, [H, W, 3] in [0, 1], and where they show it, [H, W]
     views: tuple[tuple[Camera, NDArray[np.float32], NDArray[np.bool_]], ...]
     ctx: StageContext  # backend and device
 
     @staticmethod
-    def of(splats: Splats, scene: Scene, ctx: StageContext) -> SelfPsnr:
-        """Renders `splats` at the cameras of `scene`; ReconstructionError if none sees anything."""
-        renders = [(view.camera, *_render(splats, view.camera, ctx)) for view in scene.train]
+    def from_renders(splats: Splats, cameras: Sequence[Camera], ctx: StageContext) -> SelfPsnr:
+        """Renders `splats` at the cameras; ReconstructionError if none sees anything."""
+        renders = [(camera, *_render(splats, camera, ctx)) for camera in cameras]
         views = tuple(view for view in renders if view[2].any())
         if not views:
             raise ReconstructionError(

@@ -1,1 +1,1 @@
-"""What is known of walls and metres: the mesh, its planes, their measures and the plan."""
+"""Everything about walls and metres: the mesh, its planes, their measures and the plan."""

@@ -1,4 +1,4 @@
-"""Writing of the mesh and of the plan of its room, and the check of what was written."""
+"""Writing of the mesh and of the plan of its room, and the check of the written files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ logger = logging.getLogger("recon")
 
 
 def write_mesh_file(path: Path, result: MeshResult, up: NDArray[np.float64]) -> Path:
-    """Writes a mesh and compares what reads back; a .glb gets the axes of glTF."""
+    """Writes a mesh, reads it back and compares; a .glb gets the axes of glTF."""
     axes = nearest_axes(up) if path.suffix == ".glb" else None
     write_mesh(path, result.mesh, axes=axes)
     _verify_mesh(path, result.mesh, axes)
@@ -53,5 +53,5 @@ def _verify_mesh(path: Path, mesh: Mesh, axes: NDArray[np.float64] | None) -> No
             and np.abs(back.colors.astype(int) - mesh.colors).max() <= 1)
     if not same:
         raise WorkspaceError(
-            f"{path} reads back as another mesh than was written.",
+            f"{path} does not read back as the mesh that was written.",
             hint="Check the disk, then run `recon export --again`.")

@@ -1,7 +1,7 @@
 """The loops over voxels, pixels and vertices that NumPy would take minutes for.
 
-They are compiled when the first mesh is made, and kept beside those of the rasterizer. What a block
-of work computes does not depend on the thread that takes it.
+They are compiled when the first mesh is made, and kept beside those of the rasterizer. The
+result of a block of work does not depend on the thread that takes it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ CELLS = SIDE**3
 _BLOCKS_AT_ONCE, _VERTICES_AT_ONCE = 64, 256
 _HALF_DIAGONAL = 0.8660254  # of a cube
 _LEAST_COSINE = 0.1  # between ray and normal, for a view to count as one of this side
-# columns of what `observe` counts
+# columns of the counts of `observe`
 SHOWN, SEEN_THROUGH = 0, 1
 
 
@@ -33,7 +33,7 @@ def integrate(counter, blocks, values, weights, depth, gain, view, voxel, band, 
         view: `soa.Viewpoint`.
         voxel: side of a voxel; band: truncation; near: least depth of a voxel, world units.
 
-    Behind half of the band weights fall to zero at its end: what lies there is another surface.
+    Behind half of the band weights fall to zero at its end: there begins another surface.
     """
     R, t = view.R, view.t
     reach = voxel * SIDE * _HALF_DIAGONAL + band

@@ -1,7 +1,7 @@
 """Measures of a room from the planes of its mesh: ceiling height, footprint, lengths of its walls.
 
 Each has an interval of about 95% from two errors: how far the surface scatters about its planes,
-and the scale. What is not found is said, not guessed.
+and the scale. Missing measures are reported, not guessed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _UPRIGHT = 0.10  # cosine to up up to which it is upright
 _SAME = 0.96  # cosine within which two walls face the same way
 _SCATTER = 1.05  # times the distance of a wall; a cupboard is deeper, fog is not
 _LEAST_WALL = 0.25  # of the area of the largest wall that faces the same way
-_MOST_OUTSIDE = 0.1  # share of the floor outside the footprint, else the room is no convex one
+_MOST_OUTSIDE = 0.1  # share of the floor outside the footprint, else the room is not convex
 _SIGMAS = 1.96  # of an interval of 95%, for a normal distribution
 # Share of a plane's scatter that its place is uncertain by: bumps of a wall are as long as
 # Gaussians, so that a wall has some tens of independent ones.
@@ -31,7 +31,7 @@ _SHARE_OF_SPREAD = 0.5
 
 @dataclass(frozen=True, eq=False)
 class RoomFrame:
-    """What measures need to know of the exported world: its unit is the metre."""
+    """Facts about the exported world that measures need: its unit is the metre."""
 
     up: NDArray[np.float64]  # [3] unit vector
     scale_error: float  # relative standard error of the scale
@@ -55,13 +55,13 @@ class Measure:
 
 @dataclass(frozen=True, eq=False)
 class RoomMeasures:
-    """What is known of a room; lengths in metres."""
+    """The measures of a room; lengths in metres."""
 
     height: Measure | None  # from floor to ceiling
     floor_area: Measure | None  # of the footprint
     walls: tuple[Measure, ...]  # lengths of the sides of the footprint, in order
     footprint: NDArray[np.float64] | None  # [W, 2] corners on the plan, counter-clockwise
-    notes: tuple[str, ...]  # what was not found
+    notes: tuple[str, ...]  # measures that were not found
     # [S, 2, 2] cut through the mesh at 1 m, on the plan
     cut: NDArray[np.float64] = field(repr=False)
     axes: NDArray[np.float64] = field(repr=False)  # [2, 3] right and up of the plan in the world
@@ -79,7 +79,7 @@ class RoomMeasures:
 
 def measure_room(
     mesh: Mesh,
-    planes: Sequence[tuple[Plane, Plane | None]],  # of the mesh, and what points make of them
+    planes: Sequence[tuple[Plane, Plane | None]],  # of the mesh, and as points confirm them
     centers: NDArray[np.float64],  # [C, 3] cameras
     up: NDArray[np.float64],  # [3] unit vector
     scale_error: float,  # relative standard error of the scale
@@ -109,15 +109,15 @@ def measure_room(
         value = float(floor.heights(middle[None])[0] + ceiling.heights(middle[None])[0])
         height = _measure(value, np.hypot(doubts[id(floor)], doubts[id(ceiling)]), scale_error)
     base = middle @ up - (floor.heights(middle[None])[0] if floor is not None else 0.0)
-    sure = {id(confirmed) for _, confirmed in planes if confirmed is not None}
-    walls = _outer_walls(best, centers, up, sure)
+    confirmed_ids = {id(confirmed) for _, confirmed in planes if confirmed is not None}
+    walls = _outer_walls(best, centers, up, confirmed_ids)
     axes = _plan_axes(walls, up)
     footprint, lengths, area = _footprint(walls, axes, middle, doubts, scale_error)
     if footprint is None:
         notes.append(f"Walls were found on {len(walls)} sides, which do not enclose a room, so "
                      "there is no footprint.")
     elif floor is not None and _share_outside(mesh, floor, axes, footprint) > _MOST_OUTSIDE:
-        notes.append("The floor goes on beyond the walls that were found: the room is not convex, "
+        notes.append("The floor continues beyond the walls found: the room is not convex, "
                      "or open, so there is no footprint.")
         footprint, lengths, area = None, (), None
     cut = cut_mesh(mesh, up, float(base) + 1.0)
@@ -216,7 +216,7 @@ def _footprint(
     for row in range(count):
         pair = [row, (row + 1) % count]
         turn = normals[pair[0]][0] * normals[pair[1]][1] - normals[pair[0]][1] * normals[pair[1]][0]
-        if turn < 0.1:  # the next wall is no turn to the left: the walls leave a side open
+        if turn < 0.1:  # the next wall does not turn left: the walls leave a side open
             return None, (), None
         corners.append(np.linalg.solve(normals[pair], offsets[pair]))
     polygon = np.stack(corners)

@@ -1,4 +1,4 @@
-"""The mesh of a scene: depth maps, their fusion, and what is left of the surface.
+"""The mesh of a scene: depth maps, their fusion, and the cleaned surface.
 
 A triangle stays where a view shows it: rims of the truncation band, backs of walls and layers
 behind others are seen by none.
@@ -50,7 +50,7 @@ class MeshResult:
     mesh: Mesh
     voxel: float  # world units
     triangles_before: int  # before they were simplified
-    planes: list[tuple[Plane, Plane | None]]  # if looked for: large ones, what points make of them
+    planes: list[tuple[Plane, Plane | None]]  # if looked for: large ones, also confirmed
 
     def describe(self) -> str:
         """Returns triangles and voxels as part of a sentence."""
@@ -64,7 +64,7 @@ def build_mesh(
     splats: Splats, views: Sequence[TrainView], points: NDArray[np.float64] | None,
     ctx: StageContext, *, max_triangles: int, voxel: float | None = None,
 ) -> MeshResult:
-    """Returns the mesh of what the views show of a scene.
+    """Returns the mesh of the surfaces that the views show.
 
     Args:
         splats: on the device of `ctx`.

@@ -15,7 +15,7 @@ _COARSE = 2.0  # voxels; a side of those that planes are looked for in
 def surface_planes(
     maps: DepthMaps, voxel: float, farthest: float, points: NDArray[np.float64]
 ) -> list[tuple[Plane, Plane | None]]:
-    """Returns the large planes of the surface, each with what triangulated points make of it."""
+    """Returns the large planes of the surface, each also as triangulated points confirm it."""
     band = _COARSE * voxel
     vertices, faces = extract(fuse(maps, band, farthest))
     centers, normals, areas = face_geometry(vertices, faces)

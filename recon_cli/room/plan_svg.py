@@ -17,7 +17,7 @@ _REACH = 99.5  # percentile of the cut that the plan shows, where there is no fo
 
 
 def draw_plan(measures: RoomMeasures) -> str:
-    """Returns the plan; without walls the cut alone, and what was not found below it."""
+    """Returns the plan; without walls the cut alone, and the missing measures below it."""
     cut, footprint = measures.cut, measures.footprint
     cut = cut[:: max(1, -(-len(cut) // _MOST_SEGMENTS))]
     low, high = _bounds(cut, footprint)
@@ -44,7 +44,7 @@ def draw_plan(measures: RoomMeasures) -> str:
 
 
 def describe(measures: RoomMeasures) -> list[str]:
-    """Returns the measures and what was not found, a line each."""
+    """Returns the measures and notes about missing ones, a line each."""
     lines = []
     if measures.height is not None:
         lines.append(f"Ceiling height {measures.height.text('m')}")

@@ -16,7 +16,7 @@ _TRIALS = 400  # candidates for each plane, each through one point along its nor
 _SAMPLE = 12_000  # points that candidates are scored on
 _LEAST_COSINE = 0.8  # between a plane and the normals of its points: reconstructed walls are bumpy
 _MOST_PLANES = 24
-_LEAST_SHARE = 0.015  # of the whole area; a wall of a room is some per cent, a table less
+_LEAST_SHARE = 0.015  # of the total area; a wall of a room is some per cent, a table less
 _STEPS = 8  # of the reweighted fit; it converges in about four
 
 
@@ -95,13 +95,13 @@ _SURE_PEAK = 0.5  # share from which on they may lie as far off as they are look
 _MOST_SHIFT = 3.0  # spreads
 _LEAST_PARALLEL = 0.99  # cosine of the turn
 _CELL = 6.0  # bands, side of the cells in which points count as over the plane
-_LAYER = 0.4  # of a band, thickness of what points make of a wall
+_LAYER = 0.4  # of a band, thickness of a wall as points show it
 
 
 def confirm_all(
     planes: list[Plane], surface: NDArray[np.float64], points: NDArray[np.float64], band: float
 ) -> list[Plane | None]:
-    """Returns what `confirm` makes of each plane, of those that lean also upright.
+    """Returns each plane as `confirm` fits it; leaning ones also upright.
 
     Where the surface of a plane is too rough to say how it leans, as of a blank ceiling, it is
     tried parallel to the confirmed planes that it is nearly parallel to.

@@ -37,7 +37,7 @@ class ScaleBetween:
 
 @dataclass(frozen=True)
 class Place:
-    """A point in world units, the camera of a frame, or what a frame shows at a pixel."""
+    """A point in world units, the camera of a frame, or the surface at a pixel of a frame."""
 
     frame: str | None = None
     pixel: tuple[float, float] | None = None  # the centre of the first one is 0.5, 0.5
@@ -54,7 +54,7 @@ class Measurement:
     scale: float  # metres in one world unit
 
     def to_json(self) -> dict[str, Any]:
-        """Returns what was measured as JSON values."""
+        """Returns the measurement as JSON values."""
         return {
             "a": self.request.a, "b": self.request.b, "metres": self.request.metres,
             "a_xyz": self.a.tolist(), "b_xyz": self.b.tolist(), "scale": self.scale}
@@ -63,7 +63,7 @@ class Measurement:
 def parse_place(text: str, names: Collection[str]) -> Place:
     """Returns the place that a text names: a frame (with or without its suffix), point or pixel.
 
-    ConfigError if it is none of the three, or there is no such frame among `names`.
+    ConfigError if it is not one of the three, or its frame is not among `names`.
     """
     if (name := _frame(text, names)) is not None:
         return Place(name)

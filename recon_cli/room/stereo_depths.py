@@ -36,7 +36,7 @@ def with_stereo(
     Args:
         maps: of the Gaussians' surface. They say where to search, count less, and not at all in
             pixels where stereo finds another depth.
-        box: least and greatest corner [3] of the scene; what lies outside was cut off.
+        box: least and greatest corner [3] of the scene; everything outside was cut off.
     """
     rows = np.unique(np.linspace(
         0, len(maps.views) - 1, min(len(maps.views), _MOST_VIEWS)).round().astype(int))

@@ -19,10 +19,10 @@ from recon_cli.room.depth_maps import DepthMaps
 from recon_cli.room.kernels import CELLS, SIDE, integrate
 from recon_cli.scene.camera import Camera
 
-BAND = 3.0  # voxels before and behind a surface that are told apart from it
+BAND = 3.0  # truncation: voxels before and behind a surface
 BYTES = 8 * CELLS  # of a block
 _STRIDE = 3  # pixels between those that blocks are made for; they lie much closer than a block
-_CHUNK = 8  # blocks along the side of what marching cubes takes at once
+_CHUNK = 8  # blocks along the side of a chunk for marching cubes
 _PART = 2048  # parts of a voxel within which two chunks have the same vertex
 _OFFSET, _BITS = 1 << 20, 21  # of a coordinate of a block in its key
 
@@ -96,9 +96,9 @@ def extract(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         count += len(points)
     places, rows = np.unique(np.concatenate(vertices), axis=0, return_inverse=True)
     triangles = rows.reshape(-1)[np.concatenate(faces)]
-    whole = ((triangles[:, 0] != triangles[:, 1]) & (triangles[:, 1] != triangles[:, 2])
+    proper = ((triangles[:, 0] != triangles[:, 1]) & (triangles[:, 1] != triangles[:, 2])
              & (triangles[:, 2] != triangles[:, 0]))
-    return (places / _PART + 0.5) * volume.voxel, triangles[whole]
+    return (places / _PART + 0.5) * volume.voxel, triangles[proper]
 
 
 def pixel_rays(camera: Camera) -> NDArray[np.float64]:

@@ -1,8 +1,8 @@
-"""Axes of splat files by what x, y and z point at, and the way into the axes of recon.
+"""Axes of splat files by the directions of x, y and z, and the way into the axes of recon.
 
 A name such as "rdf" is read as x right, y down, z front. Those that have up or down on y are turned
 into "rdf", the axes of a .ply, whose up is -y; those that have it on z into "rfu", whose up is z.
-Both take nothing but changes of sign. The numbers are those of the extension 0xADBE0003 of SPZ
+Only signs change. The numbers are those of the extension 0xADBE0003 of SPZ
 (https://github.com/nianticlabs/spz, `CoordinateSystem`).
 """
 
@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import Splats
@@ -19,6 +21,13 @@ from recon_cli.scene.splats import Splats
 AXES = ("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf",
         "lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu")
 PLY, Z_UP = "rdf", "rfu"
+# Unit vectors of the axes that can be up in a file, by name.
+UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0), "y": (0.0, 1.0, 0.0)}
+
+
+def nearest_up(up: NDArray[np.float64]) -> str:
+    """Returns z, -y or y, whichever is nearest to a unit vector [3]."""
+    return max(UP, key=lambda name: float(np.dot(UP[name], up)))
 
 
 def up_of(axes: str) -> str:
@@ -32,7 +41,7 @@ def turn_from(axes: str, splats: Splats) -> Splats:
 
 
 def signs(axes: str) -> list[int]:
-    """Returns what each axis is multiplied with, 1 or -1, to get to "rdf" or "rfu"."""
+    """Returns the factor of each axis, 1 or -1, that leads to "rdf" or "rfu"."""
     ours = PLY if up_of(axes) == "-y" else Z_UP
     return [1 if theirs == own else -1 for theirs, own in zip(axes, ours, strict=True)]
 

@@ -2,7 +2,7 @@
 
 A pair becomes the Gaussian with its mass, mean and covariance (moment matching), as in the levels
 of "A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets"
-(Kerbl et al. 2024, section 4.2). Mass is opacity times the area that is seen.
+(Kerbl et al. 2024, section 4.2). Mass is opacity times visible area.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from recon_cli.scene.splats import SH_C0, Splats
 
 _NEIGHBOURS = 8  # that a Gaussian may be merged with
 _ROUNDS = 6  # of matching on one set of neighbours; most find a partner
-_COLOR = 10.0  # what a colour that differs by 1 costs against a distance of one radius, squared
-_EVERY = 0.05  # what any merge costs, in the same unit
+_COLOR = 10.0  # cost of a colour difference of 1, relative to a distance of one radius, squared
+_EVERY = 0.05  # cost of any merge, in the same unit
 _OPAQUE = 0.999  # the most that a merged opacity can be: its logit has to be finite
 _FAINT = 1e-6  # and the least
 
@@ -31,7 +31,7 @@ def coarsen(splats: Splats, count: int) -> Splats:
 
     All of them have coefficients if any has. Pairs that change least are merged first.
     """
-    current = _Moments.of(splats)
+    current = _Moments.from_splats(splats)
     while len(current.mass) > max(1, count):
         current = _merge_once(current, len(current.mass) - max(1, count))
     return current.splats()
@@ -44,7 +44,7 @@ class _Moments:
         self.mass, self.mean, self.covariance, self.color = mass, mean, covariance, color
 
     @classmethod
-    def of(cls, splats: Splats) -> _Moments:
+    def from_splats(cls, splats: Splats) -> _Moments:
         """Returns the moments of Gaussians."""
         scales = np.exp(_array(splats.log_scales))
         quats = _array(splats.quats)
@@ -83,7 +83,7 @@ def _array(values: torch.Tensor) -> Doubles:
 
 
 def _area(scales: Doubles) -> Doubles:
-    """Returns what is seen of ellipsoids [N, 3], about: the product of the two longer axes."""
+    """Returns the visible area of ellipsoids [N, 3], roughly: the product of the longer axes."""
     return np.asarray(np.sort(scales, axis=1)[:, 1:].prod(axis=1))
 
 
@@ -124,8 +124,8 @@ def _match(moments: _Moments, most: int) -> tuple[Rows, Rows]:
         open_costs = np.where(free[near] & (near >= 0) & free[:, None], cost, np.inf)
         choice = open_costs.argmin(axis=1)
         best, least = near[rows, choice], open_costs[rows, choice]
-        # Each proposes to its best neighbour. What is the cheapest for both of a pair is accepted:
-        # there always is some, though neighbours need not be each other's.
+        # Each proposes to its best neighbour. A pair that is the cheapest for both is accepted:
+        # there always is one, though neighbours need not be each other's.
         proposers = np.flatnonzero(np.isfinite(least))
         if not len(proposers):
             break
@@ -138,7 +138,7 @@ def _match(moments: _Moments, most: int) -> tuple[Rows, Rows]:
         pairs = proposers[accepted], targets[accepted], least[proposers[accepted]]
         free[pairs[0]] = free[pairs[1]] = False
         found.append(pairs)
-    if not found:  # too large or too small for numbers: any two will do
+    if not found:  # costs overflow: any two will do
         return rows[:1], rows[1:2]
     first, second, costs = (np.concatenate(part) for part in zip(*found, strict=True))
     chosen = np.argsort(costs, kind="stable")[:most]
@@ -146,7 +146,7 @@ def _match(moments: _Moments, most: int) -> tuple[Rows, Rows]:
 
 
 def _costs(moments: _Moments, near: Rows) -> Doubles:
-    """Returns what merging each Gaussian with each of its neighbours [N, K] would change."""
+    """Returns the cost of merging each Gaussian with each of its neighbours [N, K]."""
     cost = np.empty(near.shape)
     variance = np.trace(moments.covariance, axis1=1, axis2=2) / 3
     color = SH_C0 * moments.color[:, 0]

@@ -16,10 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.io.views import evenly_spread
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.splats.foreign import count_terms, drop_not_finite
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.ply import is_antialiased, read_up
 from recon_cli.splats.ply_tables import Element, format_header, read_header, read_tables
 from recon_cli.splats.values import (
@@ -45,6 +46,7 @@ _BOUNDS = [*_PLACE, *_SCALE, *_COLOR]
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 _BITS, _SHIFTS = (11, 10, 11), (21, 11, 0)
 _SCALE_RANGE = 20.0  # of log scales; one of -1000 would leave the others of its chunk no bits
+_MOST_CENTERS = 32  # of the views, whose mean colour the rounding leaves alone
 _STEP = 1 / 32  # of a coefficient: 256 steps from -4 to 4
 
 Words = NDArray[np.uint32]
@@ -55,7 +57,7 @@ def write_compressed_ply(
 ) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
 
-    What lies far outside comes first: in a chunk of the room it would leave the others no bits.
+    Far outliers come first: in a chunk of the room they would leave the others no bits.
     The Gaussians of the room that fill the last chunk of these lose theirs, so they are the most
     transparent ones: small ones would show, as each is seen as large as a pixel at least.
 
@@ -143,23 +145,18 @@ def _mean_change(means: Floats, sh_rest: Floats, centers: NDArray[np.float64]) -
     return (total / len(centers)).numpy()
 
 
-def read_compressed_ply(path: Path) -> Splats:
-    """Returns the Gaussians of a compressed .ply in the file's order and degree.
+def load_compressed_ply(path: Path) -> LoadedScene:
+    """Returns the scene of a compressed .ply in its order and degree, with its comments.
 
     Files without bounds of colours are supported. Gaussians that are not finite are dropped and
     harmonics of degree 4 cut, with a warning. FormatError if damaged or another kind of .ply.
     """
-    return load_compressed_ply(path).splats
-
-
-def load_compressed_ply(path: Path) -> LoadedScene:
-    """Returns the scene of a compressed .ply, and what its comments say of it."""
     header = read_header(path)
     kinds = {each.name: _property_types(each) for each in header.elements}
     colored = not kinds.get("chunk", {}).keys().isdisjoint(_COLOR)
     if not (_has(kinds.get("chunk", {}), _BOUNDS if colored else _PLACE + _SCALE, "f4")
             and _has(kinds.get("vertex", {}), _PACKED, "u4")):
-        raise FormatError(f"{path} is no compressed .ply.")
+        raise FormatError(f"{path} is not a compressed .ply.")
     tables = read_tables(header)
     chunk, vertex = tables["chunk"], tables["vertex"]
     n = len(vertex)
@@ -222,7 +219,7 @@ def _harmonics(path: Path, tables: dict[str, NDArray[np.void]], n: int) -> Float
     names = [f"f_rest_{i}" for i in range(len(kinds))]
     if len(table) != n or set(names) != kinds.keys() or any(
             kinds[name][0] != "u1" for name in names):
-        raise FormatError(f"{path} has harmonics that do not make a degree of its Gaussians.")
+        raise FormatError(f"{path} has harmonics that do not fill a degree for its Gaussians.")
     kept = min(count_terms(path, len(names)), TERMS[-1])
     return _decode_harmonics(np.stack([table[name] for name in names], axis=1))[:, :kept]
 
@@ -233,3 +230,12 @@ def _decode_harmonics(coded: Bytes) -> Floats:
     steps[steps > 0] += 0.5  # a byte means the middle of its step, but 0 and 255 the ends
     steps[steps > 255] = 256
     return ((steps - 128) * np.float32(_STEP)).reshape(len(coded), 3, -1).transpose(0, 2, 1)
+
+
+def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+    seen_from = evenly_spread(settings.views, _MOST_CENTERS)
+    centers = np.stack([camera.center for _, camera in seen_from]) if seen_from else None
+    write_compressed_ply(path, splats.with_sphere(), centers=centers)
+
+
+FORMAT = SplatFormat(load_compressed_ply, _write_with)

@@ -1,7 +1,7 @@
-"""Values that other programs write in their own way: found by evidence, converted, and said.
+"""Values that other programs write in their own way: found by evidence, converted, and reported.
 
-Rows that are not finite are dropped; opacities and scales that are no logits and logarithms are
-recognized by values that no trained scene has as such; positions far from the origin, which float32
+Rows that are not finite are dropped; opacities and scales that are not logits and logarithms are
+recognized by values that no trained scene has; positions far from the origin, which float32
 would round by more than a Gaussian is large, are moved to it.
 """
 
@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import TERMS
-from recon_cli.splats.loaded import Origin
+from recon_cli.splats.format import Origin
 
-_MOST_BAD = 0.5  # of all rows; a file that has more is another one than its header says
-# Fewer Gaussians, or nearly equal opacities, are no evidence of what their numbers mean.
+_MOST_BAD = 0.5  # of all rows; a file with more does not match its header
+# Fewer Gaussians, or nearly equal opacities, are not enough evidence.
 _ENOUGH, _SPREAD = 50, 0.25
 # Gaussians whose centre is within one size of a place, on the mean: .003 in a trained room, but 45
 # if its sizes are read as logarithms.
 _COVERED = 1.0
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
-_ROUNDING = 0.1  # of the median Gaussian's size: what moves by more, float32 cannot hold
+_ROUNDING = 0.1  # of the median Gaussian's size: float32 cannot hold positions that move by more
 _MOST_DEGREE = 10
 FLAT = math.log(1e-6)  # log scale of a flat Gaussian, as SuperSplat sets it
 
@@ -65,20 +65,20 @@ def drop_not_finite(
 def count_terms(path: Path, coefficients: int) -> int:
     """Returns the terms a channel of a file with that many coefficients of degrees 1 and up.
 
-    FormatError if that many make no degree.
+    FormatError if that many do not fill a degree.
     """
     degrees = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(_MOST_DEGREE + 1)}
     if coefficients not in degrees:
         raise FormatError(
             f"{path} has {coefficients} coefficients of spherical harmonics beside the first "
-            "(f_rest); 0, 9, 24, 45 or 72, numbered from 0, make a degree.",
+            "(f_rest); 0, 9, 24, 45 or 72, numbered from 0, fill a degree.",
             hint="Export it again from the program it came from.")
     warn_of_degree(path, degrees[coefficients])
     return coefficients // 3
 
 
 def warn_of_degree(path: Path, degree: int) -> None:
-    """Warns if a file is of a higher degree than recon has."""
+    """Warns if a file has a higher degree than recon supports."""
     most = len(TERMS) - 1
     if degree > most:
         logger.warning("%s: harmonics of degree %d are cut to degree %d, so colours change a "
@@ -117,12 +117,12 @@ def _covers_everything(means: NDArray[Any], log_scales: NDArray[Any]) -> bool:
 
 
 def find_origin(means: NDArray[Any], log_scales: NDArray[Any]) -> Origin | None:
-    """Returns what to subtract from positions [N, 3]; None if float32 holds them as they are."""
+    """Returns the point to subtract from positions [N, 3]; None if float32 holds them as is."""
     middle = np.median(means.astype(np.float64), axis=0)
     rounding = float(np.spacing(np.float32(np.abs(middle).max()))) / 2
     size = math.exp(float(np.median(log_scales)))
     if not _ROUNDING * size < rounding < math.inf:
         return None
-    whole = np.rint(middle)
-    x, y, z = (float(value) for value in (whole if whole.any() else middle))
+    rounded = np.rint(middle)
+    x, y, z = (float(value) for value in (rounded if rounded.any() else middle))
     return Origin((x, y, z), rounding, size, rounded=means.dtype == np.float32)

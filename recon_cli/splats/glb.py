@@ -3,7 +3,7 @@
 One primitive of points: POSITION; ROTATION, a unit quaternion xyzw; SCALE, the standard deviations
 themselves; OPACITY, after the sigmoid; SH_DEGREE_l_COEF_n, in INRIA's basis, signs and order; and
 COLOR_0 for programs that know nothing of Gaussians, linear as all colours of vertices in glTF. All
-are float32 but COLOR_0, which has 16 bits: 8 are too few for what is dark and linear. Drafts of the
+are float32 but COLOR_0, which has 16 bits: 8 are too few for dark linear colours. Drafts of the
 extension had logarithms in SCALE; a file that has numbers below 0 there is refused.
 
 The world of glTF is right-handed with +Y up. A scene is rotated into it, with its coefficients,
@@ -31,8 +31,9 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined, transformed
+from recon_cli.splats.axes import nearest_up
 from recon_cli.splats.foreign import drop_not_finite, warn_of_degree
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     UntrustedFile,
     linear_from_srgb,
@@ -109,11 +110,6 @@ def nearest_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return _UP[nearest_up(up)]
 
 
-def nearest_up(up: NDArray[np.float64]) -> str:
-    """Returns z, -y or y, whichever is nearest to a unit vector [3]."""
-    return max(_UP, key=lambda name: float(_UP[name][1] @ up))
-
-
 def _coefficient_names(degree: int) -> list[str]:
     """Returns the names of the attributes of degrees 1 to `degree`, in the order of `sh_rest`."""
     return [f"{_NAME}:SH_DEGREE_{band}_COEF_{at}"
@@ -160,20 +156,15 @@ def pack_glb(value: dict[str, Any], data: bytes) -> bytes:
         _CHUNK.pack(len(data), _BIN), data])
 
 
-def read_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> Splats:
-    """Returns the Gaussians of a .glb as float32 tensors; other points and meshes are skipped.
+def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedScene:
+    """Returns the scene of a .glb and its axis that is up; other points and meshes are skipped.
 
     The order is the file's; where several primitives hold Gaussians, those with coefficients come
     first. Behind the last one of a primitive that has any, Gaussians are of degree 0. `axes` are as
     in `write_glb`; None for those that the file records, or else `Z_UP`. FormatError if the file is
-    missing or damaged, holds no Gaussians, or needs what is not supported: compression, another
-    kernel, linear colours, nodes that stretch. Gaussians that are not finite are dropped.
+    missing or damaged, holds no Gaussians, or needs an unsupported feature: compression,
+    another kernel, linear colours, nodes that stretch. Gaussians that are not finite are dropped.
     """
-    return load_glb(path, axes=axes).splats
-
-
-def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedScene:
-    """Returns the scene of a .glb and its axis that is up; see `read_glb`."""
     container = Container(path)
     required = container.json.get("extensionsRequired", [])
     if not isinstance(required, list) or not all(name in _SUPPORTED for name in required):
@@ -248,7 +239,7 @@ def _read_primitive(
         raise container.error("scales below 0 or opacities beyond 0 to 1: a draft of the format?")
     present = [name for name in _coefficient_names(3) if name in attributes]
     if len(present) not in TERMS or present != _coefficient_names(TERMS.index(len(present))):
-        raise container.error(f"{len(present)} coefficients, which make no degree")
+        raise container.error(f"{len(present)} coefficients, which do not fill a degree")
     if f"{_NAME}:SH_DEGREE_4_COEF_0" in attributes:
         warn_of_degree(container.path, 4)
     rest = [values(name, "VEC3") for name in present]
@@ -276,7 +267,7 @@ def walk_meshes(container: Container) -> Iterator[tuple[dict[str, Any], Similari
     while pending:
         index, parent = pending.pop()
         if index in visited:
-            raise container.error(f"the node {index} twice: no tree")
+            raise container.error(f"the node {index} twice, which is not a tree")
         visited.add(index)
         node = container.entry("nodes", index)
         with np.errstate(over="ignore", invalid="ignore"):  # such a matrix is refused below
@@ -319,13 +310,13 @@ def _numbers(
 
 
 class Container(UntrustedFile):
-    """An open .glb; every method raises FormatError if the file does not hold what it promises."""
+    """An open .glb; every method raises FormatError if the file breaks its own promises."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, _MAGIC, ".glb")
         data = self.data
         if len(data) < _HEADER.size + _CHUNK.size:
-            raise FormatError(f"{path} is no .glb.")
+            raise FormatError(f"{path} is not a .glb.")
         _, version, length = _HEADER.unpack_from(data)
         if version != _VERSION:
             raise self.error(f"version {version} of the container; version 2 can be read")
@@ -365,9 +356,9 @@ class Container(UntrustedFile):
             raise self.error(
                 f"an accessor of {entry.get('type')!r:.40} and {component!r:.40}, not of {kind}")
         item, width = np.dtype(_COMPONENTS[component]), _WIDTHS[kind]
-        count = self.whole(entry, "count", 1, _LARGEST)
+        count = self.integer(entry, "count", 1, _LARGEST)
         part, stride = self._view(entry.get("bufferView"), item.itemsize * width)
-        start = self.whole(entry, "byteOffset", 0, _LARGEST, default=0)
+        start = self.integer(entry, "byteOffset", 0, _LARGEST, default=0)
         if start + stride * (count - 1) + item.itemsize * width > len(part):
             raise self.error(f"an accessor of {count} values that end after their buffer")
         table = np.ndarray((count, width), item, part, start, (stride, item.itemsize))
@@ -385,9 +376,9 @@ class Container(UntrustedFile):
         buffer = self.entry("buffers", view.get("buffer"))
         if view["buffer"] != 0 or "uri" in buffer:
             raise self.error("values in another file, or in none")
-        start = self.whole(view, "byteOffset", 0, _LARGEST, default=0)
-        length = self.whole(view, "byteLength", 1, _LARGEST)
-        stride = self.whole(view, "byteStride", least, _LARGEST, default=least)
+        start = self.integer(view, "byteOffset", 0, _LARGEST, default=0)
+        length = self.integer(view, "byteLength", 1, _LARGEST)
+        stride = self.integer(view, "byteStride", least, _LARGEST, default=least)
         if start + length > self.size:
             raise self.error(f"a view of {length} bytes that ends after the {self.size} there")
         return self._bytes[start:start + length], stride
@@ -401,3 +392,11 @@ class Container(UntrustedFile):
         if start + length > len(data):
             raise self.error(f"a chunk of {length} bytes that ends after the file")
         return kind, memoryview(data)[start:start + length], start + length
+
+
+def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+    axes = Z_UP if settings.up is None else nearest_axes(settings.up)
+    write_glb(path, splats.with_sphere(), axes=axes)
+
+
+FORMAT = SplatFormat(load_glb, _write_with, load_unturned=lambda path: load_glb(path, axes=Y_UP))

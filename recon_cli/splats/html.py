@@ -28,6 +28,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import turn_from
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_scene
 from recon_cli.splats.values import read_contents
 from recon_cli.workspace.atomic import write_bytes
@@ -46,7 +47,7 @@ MODULES = {
     "viewer": "viewer.js",
 }
 LICENCES = ("LICENSE-three.txt", "LICENSE-spark.txt", "LICENSE-fflate.txt")
-_STORED = "rub"  # what the page turns; its own inverse
+_STORED = "rub"  # axes that the page turns back; the turn is its own inverse
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
 _LEVELS_FROM = 500_000  # Gaussians, of which Spark makes levels of detail
 _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is measured on
@@ -194,9 +195,18 @@ def read_html(path: Path) -> Splats:
     try:
         packed = binascii.a2b_base64(data[start:end], strict_mode=True)
     except binascii.Error as error:
-        raise FormatError(f"{path} is damaged: its scene is no base64 ({error}).") from error
+        raise FormatError(f"{path} is damaged: its scene is not base64 ({error}).") from error
     if len(packed) != promised:
         raise FormatError(
             f"{path} promises a scene of {promised} bytes, but holds {len(packed)}: it is damaged.")
     stored = spz_scene(path, packed, axes=_STORED).splats
     return _enlarged(stored, int(matches[0][3] or 0))
+
+
+def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+    write_html(
+        path, splats.with_sphere(LARGEST_SCALE), title=settings.title,
+        up=Z_UP if settings.up is None else settings.up, views=settings.views)
+
+
+FORMAT = SplatFormat(lambda path: LoadedScene(read_html(path)), _write_with)

@@ -4,7 +4,7 @@ A folder holds lod-meta.json and folders of unpacked .sog files. The leaves of a
 for each level which Gaussians of which file lie in them: the viewer takes a level for each leaf by
 its distance. Level 0 is the scene, each further one has a quarter of the Gaussians.
 Source: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog, read
-together with what splat-transform writes and reads.
+together with files that splat-transform writes and reads.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.splats import Splats, joined, with_rows
 from recon_cli.splats.coarsen import coarsen
+from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.sog import (
     META,
-    SHARING,
     Unpacked,
     encode_webp,
     pack_splats,
@@ -59,7 +59,7 @@ def make_levels(splats: Splats) -> list[Splats]:
 
 
 def write_lod(
-    path: Path, levels: Sequence[Splats], *, seed: int = 0, sharing: int = SHARING[0]
+    path: Path, levels: Sequence[Splats], *, seed: int = 0, sharing: int = SHARING
 ) -> None:
     """Writes levels of a scene, the finest first, to `path`, a file named lod-meta.json.
 
@@ -72,7 +72,7 @@ def write_lod(
     for other in [*folder.glob("*_*")]:
         if _FOLDER.fullmatch(other.name) and other.is_dir():
             remove(other)
-    tree = _Tree.of(levels[0].means.detach().cpu().numpy())
+    tree = _Tree.from_means(levels[0].means.detach().cpu().numpy())
     names: list[str] = []
     for level, splats in enumerate(levels):
         leaf = tree.leaves_of(splats.means.detach().cpu().numpy())
@@ -124,7 +124,7 @@ def _split(counts: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
 class _Node:
     """A box that is cut at a coordinate of an axis, or a leaf."""
 
-    leaf: int = -1  # its number; -1 for what is cut
+    leaf: int = -1  # its number; -1 for a box that is cut
     axis: int = 0
     cut: float = 0.0
     children: tuple[_Node, ...] = ()
@@ -141,7 +141,7 @@ class _Tree:
         self._parts: list[dict[str, dict[str, int]]] = [{} for _ in range(count)]
 
     @classmethod
-    def of(cls, means: Floats) -> _Tree:
+    def from_means(cls, means: Floats) -> _Tree:
         """Returns the tree of centres [N, 3]."""
         leaves = 0
 
@@ -214,7 +214,7 @@ def _bound(box: NDArray[np.float64]) -> dict[str, list[float]]:
 def read_lod(path: Path) -> Splats:
     """Returns the Gaussians of the finest level of a lod-meta.json, and those of its environment.
 
-    FormatError if a file is missing, damaged, or does not hold what it promises.
+    FormatError if a file is missing, damaged, or breaks its own promises.
     """
     index = _Index(path)
     wanted: dict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -240,15 +240,15 @@ def read_lod(path: Path) -> Splats:
 
 
 class _Index(UntrustedFile):
-    """An open lod-meta.json; every method raises FormatError if it holds not what it promises."""
+    """An open lod-meta.json; every method raises FormatError if it breaks its own promises."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, b"{", LOD_META)
         if len(self.data) > _META_LIMIT:
             raise self.error(f"more than {_META_LIMIT >> 20} MB")
         self._meta = self.json_object(self.data)
-        # files of before version 1 have no number
-        self.whole(self._meta, "version", _VERSION, _VERSION, default=_VERSION)
+        # files from before version 1 do not have a number
+        self.integer(self._meta, "version", _VERSION, _VERSION, default=_VERSION)
         names = self._meta.get("filenames")
         if not isinstance(names, list) or len(names) > _FILES_LIMIT or not all(
                 isinstance(name, str) for name in names):
@@ -281,9 +281,9 @@ class _Index(UntrustedFile):
                 part = lods[min(lods, key=self._level)]
                 if not isinstance(part, dict):
                     raise self.error(f"the level {part!r:.40} of a leaf")
-                yield (self.whole(part, "file", 0, len(self.names) - 1),
-                       self.whole(part, "offset", 0, 1 << 31),
-                       self.whole(part, "count", 1, 1 << 31))
+                yield (self.integer(part, "file", 0, len(self.names) - 1),
+                       self.integer(part, "offset", 0, 1 << 31),
+                       self.integer(part, "count", 1, 1 << 31))
 
     def _level(self, name: str) -> int:
         if not name.isdecimal():
@@ -291,3 +291,7 @@ class _Index(UntrustedFile):
         return int(name)
 
 
+FORMAT = SplatFormat(
+    lambda path: LoadedScene(read_lod(path)),
+    lambda path, splats, settings: write_lod(
+        path, make_levels(splats.with_sphere()), sharing=settings.sharing))

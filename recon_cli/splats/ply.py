@@ -11,7 +11,7 @@ ignores unknown ones. Two infinities that other programs write are made finite: 
 opacity of exactly 0 or 1, and the logarithm of a scale of 0.
 
 A scene with a backdrop ends with the sphere of Gaussians that shows it in other programs; a comment
-in the header says what it is, and the reader makes a backdrop of it again.
+in the header describes it, and the reader turns it into a backdrop again.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
+from recon_cli.splats.axes import nearest_up
 from recon_cli.splats.foreign import (
     FLAT,
     count_terms,
@@ -38,7 +39,7 @@ from recon_cli.splats.foreign import (
     find_origin,
     undo_activations,
 )
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.ply_tables import (
     Header,
     format_header,
@@ -64,7 +65,7 @@ _MAX_LOGIT = math.log(254.75 / 0.25)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
 # the comment in the header: how many rows at the end show a backdrop, and its numbers
 _BACKDROP = re.compile(r"backdrop (\d{1,9})((?: \S+){7})")
-_ROUNDING = 1e-6  # of a value: what two machines may compute apart
+_ROUNDING = 1e-6  # of a value: by how much two machines may differ
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 logger = logging.getLogger("recon")
@@ -116,7 +117,7 @@ def _header(
 
 
 def describe_scene(up: str | None, *, antialiased: bool) -> list[str]:
-    """Returns the comments by which other programs know what is up (z only) and the rasterizer."""
+    """Returns comments that tell other programs the up axis (z only) and the rasterizer."""
     return [*(["Vertical Axis: z"] if up == "z" else []),
             *(["SplatRenderMode: mip"] if antialiased else [])]
 
@@ -154,7 +155,7 @@ def read_ply(path: Path) -> Splats:
 def load_ply(path: Path) -> LoadedScene:
     """Returns the scene in a .ply of any program, whose values may be written in other ways.
 
-    Gaussians that are not finite are dropped, opacities and sizes that are no logits or logarithms
+    Gaussians that are not finite are dropped, opacities and sizes that are not logits or logarithms
     are converted, each with a warning. Positions that float32 would round are moved to the origin.
     The errors are those of `read_ply`, but up to half of the Gaussians may be not finite.
     """
@@ -184,14 +185,14 @@ def read_up(header: Header) -> str | None:
 
 def is_antialiased(header: Header) -> bool:
     """Returns whether a comment of Brush or Postshot says that antialiasing was trained with."""
-    said = False
+    found = False
     for text in header.comments:  # the last one counts
         words = text.lower().replace(":", " ").split()
         if words[:1] == ["splatrendermode"]:
-            said = "mip" in words[1:]
+            found = "mip" in words[1:]
         elif words[:1] == ["antialiased"] and len(words) == 2:
-            said = words[1] in ("1", "true")
-    return said
+            found = words[1] in ("1", "true")
+    return found
 
 
 def _read_columns(header: Header) -> dict[str, NDArray[Any]]:
@@ -209,7 +210,7 @@ def _read_columns(header: Header) -> dict[str, NDArray[Any]]:
         groups["sh_dc"] = list(_COLOR)
     missing = [name for group in groups.values() for name in group if name not in names]
     if missing and missing != ["scale_2"]:
-        raise FormatError(f"{path} lacks the properties {', '.join(missing)}: no Gaussians.")
+        raise FormatError(f"{path} lacks the properties {', '.join(missing)} of Gaussians.")
     with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
         columns = {name: table[name].astype(np.float32)
                    for group in groups.values() for name in group
@@ -258,11 +259,11 @@ def _read_colors(path: Path, table: NDArray[np.void]) -> dict[str, NDArray[np.fl
     return {name: ((table[name].astype(np.float32) / most - 0.5) / SH_C0) for name in _COLOR}
 
 
-def _without_sphere(splats: Splats, said: tuple[int, Backdrop] | None) -> Splats:
+def _without_sphere(splats: Splats, header_backdrop: tuple[int, Backdrop] | None) -> Splats:
     """Returns splats whose last rows show a backdrop with it in place of those rows."""
-    if said is None or said[0] > len(splats):
+    if header_backdrop is None or header_backdrop[0] > len(splats):
         return splats
-    count, backdrop = said
+    count, backdrop = header_backdrop
     near = splats.select(torch.arange(len(splats) - count))
     found = dataclasses.replace(near, backdrop=backdrop)
     ours = found.with_sphere().parameters()
@@ -339,7 +340,7 @@ def write_points(path: Path, splats: Splats) -> None:
 def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     """Returns positions [P, 3] and RGB colours [P, 3], None where the file has no colours.
 
-    FormatError if the file is missing, truncated, no .ply, or holds a position that is not finite.
+    FormatError if the file is missing, truncated, not a .ply, or a position is not finite.
     """
     header = read_header(path)
     first = header.elements[0]
@@ -360,3 +361,11 @@ def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
     if colors.dtype.kind == "f":  # in [0, 1], as some programs write them
         colors = np.rint(np.nan_to_num(colors).clip(0, 1) * 255)
     return points, colors.astype(np.uint8)
+
+
+def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+    up = None if settings.up is None else nearest_up(settings.up)
+    write_ply(path, splats, comments=describe_scene(up, antialiased=settings.antialiased))
+
+
+FORMAT = SplatFormat(load_ply, _write_with)

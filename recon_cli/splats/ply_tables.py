@@ -1,7 +1,7 @@
 """The container of a .ply: its header with comments, and the tables of its elements.
 
-ASCII and both byte orders are read, and any type of number. What a header promises is compared with
-the size of the file before anything is allocated.
+ASCII and both byte orders are read, and any type of number. The promises of a header are
+compared with the size of the file before anything is allocated.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Returns the header of a .ply; FormatError if the file cannot be read or is none."""
+    """Returns the header of a .ply; FormatError if the file cannot be read or is not a .ply."""
     refuse_special(path)
     try:
         with path.open("rb") as file:
@@ -70,7 +70,7 @@ def read_header(path: Path) -> Header:
         raise FormatError(f"{path} cannot be read: {error}.") from error
     end = _END.search(head)
     if not head.startswith((b"ply\n", b"ply\r\n")) or not end:
-        raise FormatError(f"{path} is no .ply file.")
+        raise FormatError(f"{path} is not a .ply file.")
     texts = head[:end.start()].decode("ascii", "replace").splitlines()
     lines = [text.split() for text in texts]
     lines = [line for line in lines[1:] if line and line[0] not in ("comment", "obj_info")]
@@ -100,7 +100,7 @@ def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
         is_list = line[0] == "property" and line[1:2] == ["list"] and len(line) == 5
         if not is_list and (line[0] != "property" or len(line) != 3 or line[1] not in _TYPES):
             raise FormatError(
-                f"{path} has a {name} with {' '.join(line)[:80]}, which is no number.")
+                f"{path} has a {name} with {' '.join(line)[:80]}, which is not a number.")
     names = [line[-1] for line in properties]
     if len(set(names)) != len(names):
         raise FormatError(f"{path} names a property of {name} twice.")
@@ -115,7 +115,7 @@ def _element(lines: list[list[str]], kind: str, path: Path) -> Element:
 def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
     """Returns the rows of every element by its name.
 
-    FormatError if the size is not what the header says, or an element holds lists, as in a mesh.
+    FormatError if the size differs from that in the header, or an element is lists, as in a mesh.
     """
     for element in header.elements:
         if element.count and element.row is None:
@@ -194,7 +194,7 @@ def _parse_rows(lines: list[str], row: np.dtype[np.void]) -> NDArray[np.void]:
         if kind.kind in "ui":
             limits = np.iinfo(kind)
             if not ((values >= limits.min) & (values <= limits.max)).all():  # NaN fails too
-                raise ValueError(f"{name} is no {kind.name}")
-        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+                raise ValueError(f"{name} is not a {kind.name}")
+        with np.errstate(over="ignore"):  # values beyond float32 become infinite
             table[name] = values
     return table

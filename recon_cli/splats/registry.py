@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -12,64 +12,24 @@ import torch
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
-from recon_cli.splats.compressed_ply import (
-    load_compressed_ply,
-    read_compressed_ply,
-    write_compressed_ply,
-)
-from recon_cli.splats.glb import Y_UP, load_glb, read_glb, write_glb
-from recon_cli.splats.html import read_html, write_html
-from recon_cli.splats.loaded import LoadedScene
-from recon_cli.splats.lod import LOD_META, make_levels, read_lod, write_lod
-from recon_cli.splats.ply import load_ply, read_ply, write_ply
-from recon_cli.splats.sog import load_sog, read_sog, write_sog
-from recon_cli.splats.splat import read_splat, write_splat
-from recon_cli.splats.spz import load_spz, read_spz, write_spz
+from recon_cli.splats.format import LoadedScene, SplatFormat
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
 
 logger = logging.getLogger("recon")
 
-
-@dataclass(frozen=True)
-class SplatFormat:
-    """One format."""
-
-    name: str  # also the suffix of its files, after a dot; but `lod` for lod-meta.json
-    read: Callable[[Path], Splats]  # returns the Gaussians of a file; raises FormatError
-    # writes a file, whole or not at all; raises InputError if a value does not fit
-    write: Callable[[Path, Splats], None]
-    # reads the file of any program with what it says of itself; None where it cannot say anything
-    load: Callable[[Path], LoadedScene] | None = None
+FORMATS: dict[str, SplatFormat] = {
+    row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
 
 
-FORMATS: dict[str, SplatFormat] = {row.name: row for row in (
-    SplatFormat(  # before "ply"
-        "compressed.ply", read_compressed_ply, write_compressed_ply, load_compressed_ply),
-    SplatFormat("ply", read_ply, write_ply, load_ply),
-    SplatFormat("splat", read_splat, write_splat),
-    SplatFormat("spz", read_spz, write_spz, load_spz),
-    SplatFormat("sog", read_sog, write_sog, load_sog),
-    SplatFormat("glb", read_glb, write_glb, load_glb),
-    SplatFormat("html", read_html, write_html),
-    SplatFormat("lod", read_lod, lambda path, splats: write_lod(path, make_levels(splats))),
-)}
-
-
-def scene_file(folder: Path, name: str) -> Path:
-    """Returns the file of a scene in a folder and a format; that of lod has a folder of its own."""
-    return folder / name / LOD_META if name == "lod" else folder / f"splats.{name}"
-
-
-def format_of(path: Path) -> SplatFormat:
-    """Returns the format of a file by the end of its name; FormatError if that is none."""
-    if path.name.lower() == LOD_META:
-        return FORMATS["lod"]
-    for name, row in FORMATS.items():
-        if path.name.lower().endswith(f".{name}"):
-            return row
-    raise FormatError(
-        f"{path} is of no known format of Gaussians.",
-        hint="Known are " + ", ".join(f".{name}" for name in FORMATS if name != "lod")
-        + f" and {LOD_META}.")
+def format_of(path: Path) -> ExportFormat:
+    """Returns the row of a file by the end of its name; FormatError if there is no such row."""
+    rows = [EXPORT_FORMATS[name] for name in FORMATS]
+    found = [row for row in rows if row.fits_name(path.name)]
+    if not found:
+        raise FormatError(
+            f"{path} is not of a known format of Gaussians.",
+            hint=f"Known are {', '.join(row.ending for row in rows)}.")
+    return max(found, key=lambda row: len(row.ending))  # .compressed.ply before .ply
 
 
 def read_splats(path: Path) -> Splats:
@@ -77,7 +37,7 @@ def read_splats(path: Path) -> Splats:
 
     FormatError if it is damaged.
     """
-    scene = load_scene(path)
+    scene = load_splats(path)
     if scene.origin is None:
         return scene.splats
     logger.warning("%s: %s, and added again here, rounded; `recon import` leaves it out",
@@ -85,25 +45,23 @@ def read_splats(path: Path) -> Splats:
     return replace(scene.splats, means=scene.splats.means + torch.tensor(scene.origin.point))
 
 
-def load_scene(path: Path, *, axes: str | None = None) -> LoadedScene:
-    """Returns the scene of a file in any of FORMATS, and what it says of itself.
+def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:
+    """Returns the scene of a file in any of FORMATS, and the statements of the file about it.
 
-    `axes` is the name in `axes.AXES` of those that it has, whatever it says. FormatError if it is
-    damaged.
+    `axes` is a name in `axes.AXES` and wins over the axes that the file states. FormatError if it
+    is damaged.
     """
     row = format_of(path)
     if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
         raise FormatError(f"{path} is not a file.", hint="Give a file on the disk.")
+    form = FORMATS[row.name]
     try:
-        if axes is not None and row.name == "spz":
-            return load_spz(path, axes=axes)
-        if axes is not None and row.name == "glb":
-            return _turn(load_glb(path, axes=Y_UP), axes)
-        scene = row.load(path) if row.load else LoadedScene(row.read(path))
-        return scene if axes is None else _turn(scene, axes)
+        if axes is None:
+            return form.load(path)
+        return _turn((form.load_unturned or form.load)(path), axes)
     except FormatError as error:
         error.hint = error.hint or (
-            f"Copy or export it again; if it is no .{row.name}, rename it to its real format.")
+            f"Copy or export it again; if it is not a .{row.name}, rename it to its real format.")
         raise
 
 

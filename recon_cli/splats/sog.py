@@ -31,7 +31,7 @@ from PIL import Image, UnidentifiedImageError
 
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.values import (
     Bytes,
     Floats,
@@ -53,7 +53,6 @@ _TAG = 252  # of a quaternion whose greatest component is w
 _ROOT2 = math.sqrt(2)  # only the greatest component of a unit quaternion exceeds 1 / sqrt(2)
 _MAX_ENTRIES = 65535  # of a palette, besides one of zeros: labels are 16 bits
 _MAX_COUNT = 16383 * 16383  # pixels of the largest WebP
-SHARING = (16, 8, 4, 2, 1)  # Gaussians per entry of the palette, on the mean: smallest file first
 META = "meta.json"
 _META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
 _SMALL = 1 << 20  # Gaussians or pixels that are always accepted: a few hundred MB
@@ -66,7 +65,7 @@ Doubles = NDArray[np.float64]
 
 
 def write_sog(
-    path: Path, splats: Splats, *, seed: int = 0, sharing: int = SHARING[0],
+    path: Path, splats: Splats, *, seed: int = 0, sharing: int = SHARING,
     antialiased: bool = False,
 ) -> None:
     """Writes `splats` to `path`, whole or not at all; the same seed gives the same bytes.
@@ -84,9 +83,9 @@ def write_sog(
 
 def pack_splats(
     splats: Splats, groups: NDArray[np.int64] | None = None, *, seed: int = 0,
-    sharing: int = SHARING[0],
+    sharing: int = SHARING,
 ) -> tuple[dict[str, Any], dict[str, Bytes]]:
-    """Returns what meta.json holds, and the images by name; see `write_sog`.
+    """Returns the content of meta.json, and the images by name; see `write_sog`.
 
     Gaussians of ascending `groups` [N] follow each other, if there are any; either all of them or
     none have coefficients then.
@@ -138,17 +137,12 @@ def _json(book: Floats) -> list[float]:
     return [float(str(value)) for value in book]
 
 
-def read_sog(path: Path) -> Splats:
-    """Returns the Gaussians of a .sog as float32 tensors, in the file's order.
-
-    Those behind the last one that has a coefficient other than zero are of degree 0. FormatError if
-    the file is missing, damaged, of version 1, or does not hold what it promises.
-    """
-    return load_sog(path).splats
-
-
 def load_sog(path: Path) -> LoadedScene:
-    """Returns the scene of a .sog, and whether it says that it was trained with antialiasing."""
+    """Returns the scene of a .sog in the file's order, and whether antialiasing was trained.
+
+    Gaussians behind the last one that has a coefficient other than zero are of degree 0.
+    FormatError if the file is missing, damaged, of version 1, or breaks its own promises.
+    """
     archive = Archive(path)
     meta = archive.meta()
     antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
@@ -156,11 +150,11 @@ def load_sog(path: Path) -> LoadedScene:
 
 
 def read_files(archive: SogFiles) -> Splats:
-    """Returns the Gaussians of the files of a .sog; see `read_sog`."""
+    """Returns the Gaussians of the files of a .sog; see `load_sog`."""
     path, meta = archive.path, archive.meta()
     means, scales, quats, sh0 = (
         archive.part(meta, name) for name in ("means", "scales", "quats", "sh0"))
-    count = archive.whole(meta, "count", 1, _MAX_COUNT)
+    count = archive.integer(meta, "count", 1, _MAX_COUNT)
     archive.check_count(count)
     low, high = archive.numbers(means, "mins", 3, 3), archive.numbers(means, "maxs", 3, 3)
     low_name, high_name = archive.files(means, 2)
@@ -192,8 +186,8 @@ def _read_harmonics(
     if meta.get("shN") is None:
         return np.zeros((0, 0, 3), np.float32)
     part = archive.part(meta, "shN")
-    count = archive.whole(part, "count", 1, _MAX_ENTRIES + 1)
-    terms = TERMS[archive.whole(part, "bands", 1, 3)]
+    count = archive.integer(part, "count", 1, _MAX_ENTRIES + 1)
+    terms = TERMS[archive.integer(part, "bands", 1, 3)]
     entries_name, labels_name = archive.files(part, 2)
     width, lines = ROW * terms, -(-count // ROW)
     entries = archive.pixels(entries_name, width * lines, size=(width, lines))[:, :, :3]
@@ -256,7 +250,7 @@ def pack_harmonics(
 
 
 class SogFiles(UntrustedFile):
-    """The files of a .sog; every method raises FormatError if they hold not what they promise."""
+    """The files of a .sog; every method raises FormatError if they break their own promises."""
 
     size: int  # of all files, bytes
 
@@ -269,7 +263,7 @@ class SogFiles(UntrustedFile):
         meta = self.json_object(self.read(META, _META_LIMIT))
         if "version" not in meta and isinstance(meta.get("means"), dict):
             raise self.error("version 1 of the format, which is not supported")
-        if self.whole(meta, "version", 0, sys.maxsize) != 2:
+        if self.integer(meta, "version", 0, sys.maxsize) != 2:
             raise self.error(f"version {meta['version']} of the format; version 2 can be read")
         return meta
 
@@ -316,12 +310,12 @@ class SogFiles(UntrustedFile):
         try:
             with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
                 if image.mode not in ("RGB", "RGBA") or getattr(image, "n_frames", 1) != 1:
-                    raise self.error(f"{name}, which is no single image of 8 bits a channel")
+                    raise self.error(f"{name}, which is not a single image of 8 bits a channel")
                 self._check_size(image.size, name, count, most, size)
                 return np.asarray(image.convert("RGBA"))
         except (OSError, UnidentifiedImageError, ValueError, SyntaxError, zlib.error,
                 Image.DecompressionBombError) as error:
-            raise self.error(f"{name}, which is no image: {error}") from error
+            raise self.error(f"{name}, which is not an image: {error}") from error
 
     def _check_size(
         self, actual: tuple[int, int], name: str, count: int, most: int,
@@ -341,11 +335,11 @@ class Archive(SogFiles):
         super().__init__(path, _START, ".sog")
         self.size = len(self.data)
         if self.data.count(_ENTRY) > _ENTRIES:  # each costs half a kilobyte when it is listed
-            raise self.error(f"more than {_ENTRIES} entries: no .sog")
+            raise self.error(f"more than {_ENTRIES} entries, which is not a .sog")
         try:
             self._zip = zipfile.ZipFile(io.BytesIO(self.data))
         except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-            raise self.error(f"a zip that is no .sog: {error}") from error
+            raise self.error(f"a zip that is not a .sog: {error}") from error
         self._entries = {entry.filename: entry for entry in self._zip.infolist()}
         if len(self._entries) < len(self._zip.infolist()):
             raise self.error("two entries of one name")
@@ -363,11 +357,11 @@ class Archive(SogFiles):
         try:
             with self._zip.open(entry) as file:
                 data = file.read(most + 1)
-                whole = len(data) <= most and not file.read(1)
+                complete = len(data) <= most and not file.read(1)
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError,
                 NotImplementedError) as error:
             raise self.error(f"the entry {name}, which cannot be unpacked: {error}") from error
-        if not whole:
+        if not complete:
             raise self.error(f"the entry {name}, which unpacks to more than {most} bytes")
         return data
 
@@ -424,3 +418,8 @@ def path_escapes(name: str) -> bool:
     """Returns whether a path would lead out of the folder that it is unpacked to."""
     path = PurePosixPath(name.replace("\\", "/"))
     return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name
+
+
+FORMAT = SplatFormat(
+    load_sog, lambda path, splats, settings: write_sog(
+        path, splats.with_sphere(), sharing=settings.sharing, antialiased=settings.antialiased))

@@ -15,6 +15,7 @@ import numpy as np
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.splats.foreign import drop_not_finite
+from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.values import (
     decode_opacities,
     encode_opacities,
@@ -68,13 +69,13 @@ def read_splat(path: Path) -> Splats:
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {error}.") from error
     if len(data) != size or data.startswith(_OTHER_FORMATS):
-        raise FormatError(f"{path} is no .splat file.")
+        raise FormatError(f"{path} is not a .splat file.")
     rows = np.frombuffer(data, _ROW)
     rows = drop_not_finite(path, {"row": rows}, {
         "positions": rows["means"], "scales": rows["scales"]})["row"]
     scales = rows["scales"]
     if (scales < 0).any():
-        raise FormatError(f"{path} holds negative scales: it is damaged or no .splat file.")
+        raise FormatError(f"{path} holds negative scales: it is damaged or not a .splat file.")
     return splats_from_arrays(path, {
         "means": rows["means"],
         "quats": (rows["quats"].astype(np.float32) - 128) / 128,
@@ -83,3 +84,8 @@ def read_splat(path: Path) -> Splats:
         "sh_dc": (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0,
         "sh_rest": np.zeros((len(rows), 0, 3)),
     })
+
+
+FORMAT = SplatFormat(
+    load=lambda path: LoadedScene(read_splat(path)),
+    write_with=lambda path, splats, _: write_splat(path, splats.with_sphere()))

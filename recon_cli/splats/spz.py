@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import TERMS, Splats
-from recon_cli.splats.axes import AXES, PLY, turn_from, up_of
+from recon_cli.splats.axes import AXES, PLY, Z_UP, nearest_up, turn_from, up_of
 from recon_cli.splats.foreign import warn_of_degree
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     Bytes,
     Floats,
@@ -72,11 +72,13 @@ _HAS_EXTENSIONS = 2
 _EXTENSIONS_LIMIT = 1 << 20  # bytes
 _ADOBE, _ORBIT_CAMERA, _AXES = 0xADBE, 0xADBE0002, 0xADBE0003
 _AXES_RECORD = struct.Struct("<III")  # type, 4, and a number of AXES from 1; 0 means none
+# The axes that are written, by up. Without a name all programs show a file as it is, with y up.
+_AXES_BY_UP = {"z": Z_UP, "-y": PLY, "y": None}
 _ANTIALIASED = 1
-# Coefficients a channel of what a file may have; those above degree 3 are cut off.
+# Coefficients a channel that a file may have; those above degree 3 are cut off.
 _FILE_TERMS = (*TERMS, 24)
 _MAX_FRACTIONAL_BITS = 24
-# Limit of what a file may unpack to. A scene whose harmonics are all 0 reaches 5 times its size.
+# Limits of the unpacked size. A scene whose harmonics are all 0 reaches 5 times its size.
 _HARMLESS_BYTES, _MAX_RATIO = 1 << 24, 128
 _ZSTD_LEVEL = 12  # that of Niantic's program
 
@@ -96,7 +98,7 @@ def spz_bytes(
 ) -> bytes:
     """Returns the bytes of an SPZ file of `splats`, whose values are written as they are.
 
-    `axes` is the name in AXES of what they are, which the file records; None leaves it out.
+    `axes` is the name of their axes in AXES, which the file records; None leaves it out.
 
     Log scales below -10 become -10, and above 5.9375, with a warning, 5.9375; coefficients outside
     -1 to 127/128 and dc outside -3.33 to 3.33 are clipped. Positions get `most_bits` fractional
@@ -106,7 +108,7 @@ def spz_bytes(
     no Gaussians, one is too far away, or a parameter is not finite.
     """
     if version not in VERSIONS:
-        raise ValueError(f"SPZ version {version} is none of {VERSIONS}")
+        raise ValueError(f"SPZ version {version} is not one of {VERSIONS}")
     values = Splats.of({
         name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()})
     means, quats = values.means.numpy(), values.quats.numpy()
@@ -129,23 +131,18 @@ def spz_bytes(
     ])
 
 
-def read_spz(path: Path, *, axes: str | None = None) -> Splats:
-    """Returns the Gaussians of an SPZ file of version 2, 3 or 4, in the file's order and degree.
+def load_spz(path: Path, *, axes: str | None = None) -> LoadedScene:
+    """Returns the scene of an SPZ file of version 2, 3 or 4, in the file's order and degree.
 
-    They are turned from `axes`, or from those that the file records, as `axes.turn_from` does;
-    without either they stay. Harmonics of degree 4 are cut, with a warning. FormatError if the file
+    It is turned from `axes`, or from those that the file records, as `axes.turn_from` does;
+    without either it stays. Harmonics of degree 4 are cut, with a warning. FormatError if the file
     is missing, damaged, or of another format or version.
     """
-    return load_spz(path, axes=axes).splats
-
-
-def load_spz(path: Path, *, axes: str | None = None) -> LoadedScene:
-    """Returns the scene of an SPZ file, and what it says of itself; see `read_spz`."""
     return spz_scene(path, read_contents(path), axes=axes)
 
 
 def spz_scene(path: Path, data: bytes, *, axes: str | None = None) -> LoadedScene:
-    """Returns the scene of the bytes of an SPZ file; see `read_spz`."""
+    """Returns the scene of the bytes of an SPZ file; see `load_spz`."""
     header, (places, opacities, colors, scales, rotations, harmonics) = unpack(path, data)
     n, kept = header.count, TERMS[min(header.sh_degree, len(TERMS) - 1)]
     warn_of_degree(path, header.sh_degree)
@@ -218,7 +215,7 @@ def _rotations(data: Bytes) -> Floats:
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """Version, count, degree and precision of the arrays, and what a file says of them."""
+    """Version, count, degree, precision and axes of the arrays."""
 
     version: int  # 2, 3 or 4
     count: int  # Gaussians, N
@@ -254,7 +251,7 @@ def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
 def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
     """Returns the header and the six arrays of a file.
 
-    FormatError if the data is damaged, of another format, or not what its header promises.
+    FormatError if the data is damaged, of another format, or does not match its header.
     """
     try:
         if data.startswith(b"\x1f\x8b"):
@@ -266,7 +263,7 @@ def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
             else:
                 body, extensions = _split_extensions(path, data[_HEAD.size:], header, flags)
         else:
-            raise FormatError(f"{path} is no SPZ file.")
+            raise FormatError(f"{path} is not an SPZ file.")
     except (zlib.error, zstandard.ZstdError) as error:
         raise FormatError(f"{path} cannot be unpacked: {error}.") from error
     header = replace(header, axes=_read_extensions(path, extensions))
@@ -280,7 +277,7 @@ def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
         raise _truncated_error(path)
     magic, version, count, degree, bits, flags, streams = _HEAD.unpack(head)
     if magic != _MAGIC:
-        raise FormatError(f"{path} is no SPZ file.")
+        raise FormatError(f"{path} is not an SPZ file.")
     if version not in VERSIONS:
         raise FormatError(f"{path} is of SPZ version {version}; 2, 3 and 4 can be read.")
     if degree >= len(_FILE_TERMS):
@@ -356,7 +353,7 @@ def _read_extensions(path: Path, data: bytes) -> str | None:
     """Returns the axes that the extensions name, in AXES; None if none does.
 
     Those of unknown vendors are ignored, as the format requires, as are Adobe's limits of an orbit
-    camera. FormatError if they are damaged or change in another way what the arrays mean.
+    camera. FormatError if they are damaged or change the meaning of the arrays otherwise.
     """
     start, axes = 0, None
     while start < len(data):
@@ -367,7 +364,7 @@ def _read_extensions(path: Path, data: bytes) -> str | None:
             axes = _read_axes(path, data[start + _EXTENSION.size:start + _EXTENSION.size + size])
         elif kind >> 16 == _ADOBE and kind != _ORBIT_CAMERA:
             raise FormatError(
-                f"{path} has the extension {kind:#x}, which changes what its values mean.",
+                f"{path} has the extension {kind:#x}, which changes the meaning of its values.",
                 hint="Write it again without extensions.")
         start += _EXTENSION.size + size
     if start > len(data):
@@ -380,8 +377,8 @@ def _read_axes(path: Path, payload: bytes) -> str | None:
     number = int.from_bytes(payload, "little")
     if len(payload) != 4 or number > len(AXES):
         raise FormatError(
-            f"{path} names axes by {payload[:8].hex()}, which is none of the {len(AXES)} that the "
-            "format has.", hint="Give the axes with --axes, for example --axes rub.")
+            f"{path} names axes by {payload[:8].hex()}, which is not one of the {len(AXES)} of the "
+            "format.", hint="Give the axes with --axes, for example --axes rub.")
     return AXES[number - 1] if number else None
 
 
@@ -391,3 +388,14 @@ def _truncated_error(path: Path) -> FormatError:
 
 def _too_long_error(path: Path) -> FormatError:
     return FormatError(f"{path} holds more than its header promises: it is damaged or malicious.")
+
+
+def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+    write_spz(
+        path, splats.with_sphere(LARGEST_SCALE), version=settings.options.get("spz_version", 3),
+        axes=PLY if settings.up is None else _AXES_BY_UP[nearest_up(settings.up)],
+        antialiased=settings.antialiased)
+
+
+FORMAT = SplatFormat(
+    load_spz, _write_with, load_unturned=lambda path: load_spz(path, axes=PLY))

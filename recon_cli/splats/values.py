@@ -35,10 +35,11 @@ def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
 def compact_order(
     points: NDArray[np.float32], weights: NDArray[np.floating], chunk: int
 ) -> NDArray[np.int64]:
-    """Returns the Morton order of points [N, 3], with what lies far outside before all others.
+    """Returns the Morton order of points [N, 3], with the far outliers before all others.
 
-    It comes by shells, the farthest one first: what shares a chunk with points far away is left
-    few bits for its place. The last such chunk is filled with the points of the least weights [N].
+    It comes by shells, the farthest one first: points that share a chunk with distant ones are
+    left few bits for their place. The last such chunk is filled with the points of the least
+    weights [N].
     """
     exact = points.astype(np.float64)
     away = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)
@@ -78,7 +79,7 @@ class UntrustedFile:
         try:
             with path.open("rb") as file:
                 if file.read(len(start)) != start:
-                    raise FormatError(f"{path} is no {kind}.")
+                    raise FormatError(f"{path} is not a {kind}.")
                 self.data = start + file.read()
         except OSError as error:
             raise FormatError(f"{path} cannot be read: {error}.") from error
@@ -90,21 +91,21 @@ class UntrustedFile:
     def json_object(self, text: bytes) -> dict[str, Any]:
         """Returns a JSON object without NaN that is not nested too deeply."""
         def refuse_constant(name: str) -> float:
-            raise ValueError(f"{name} is no number of JSON")
+            raise ValueError(f"{name} is not a number of JSON")
 
         try:
             value = json.loads(text, parse_constant=refuse_constant)
         except (ValueError, RecursionError) as error:
             raise self.error(f"JSON that cannot be read: {error}") from error
         if not isinstance(value, dict):
-            raise self.error("JSON that cannot be read: it is no object")
+            raise self.error("JSON that cannot be read: it is not an object")
         return value
 
-    def whole(
+    def integer(
         self, part: Mapping[str, Any], name: str, least: int, most: int,
         *, default: int | None = None,
     ) -> int:
-        """Returns a whole number from `least` to `most` in an object of the JSON."""
+        """Returns an integer from `least` to `most` in an object of the JSON."""
         value = part.get(name, default)
         if type(value) is not int or not least <= value <= most:
             raise self.error(f"{name} = {value!r:.40}; needed is {least} to {most}")

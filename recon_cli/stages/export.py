@@ -1,7 +1,7 @@
 """export: a .ply that other viewers open, read back and compared before it counts as written.
 
-Other formats are written beside it, each read back and scored. What options remove first is
-reported in Gaussians and dB. transform.json holds the similarity from the trained scene to the
+Other formats are written beside it, each read back and scored. Removals by options come first and
+are reported in Gaussians and dB. transform.json holds the similarity from the trained scene to the
 exported one.
 """
 
@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.config.stages import MESH_FORMATS, PLAN, ExportConfig
+from recon_cli.config.stages import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconError, StageError, WorkspaceError
 from recon_cli.export.bounds import describe_bounds
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
-from recon_cli.export.exporter import Exporter
+from recon_cli.export.format_writer import FormatWriter, measure_size
 from recon_cli.export.kept_files import (
     KeptFiles,
     discard_files,
@@ -28,14 +29,19 @@ from recon_cli.export.kept_files import (
     made_of,
     read_records,
 )
+from recon_cli.export.reduce import reduce_scene
+from recon_cli.export.source import ExportSource
 from recon_cli.export.verify import verify_ply
 from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.splats import Splats, transformed
-from recon_cli.splats.ply import read_ply, write_ply
+from recon_cli.splats.axes import nearest_up
+from recon_cli.splats.ply import describe_scene, read_ply, write_ply
+from recon_cli.train.finished_model import FINAL
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.ply_property import PLY_PROPERTY, expected_errors, match_rows
 from recon_cli.trust.scene_trust import measure_trust, refuse_without, views_looked_at
 from recon_cli.workspace.atomic import write_json
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, PLAN
 from recon_cli.workspace.export_record import (
     ExportedFile,
     ExportSummary,
@@ -45,11 +51,10 @@ from recon_cli.workspace.export_record import (
 from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
 
 TRANSFORM = "transform.json"
-_VIEW_FORMATS = ("colmap", "transforms.json", *MESH_FORMATS)  # made of views
 
 
 def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> ExportSummary:
-    """Writes splats.ply, transform.json and the other formats; what is there already is kept."""
+    """Writes splats.ply, transform.json and the other formats; existing files are kept."""
     if config.model == "pruned" and "prune" not in inputs.folders:
         raise StageError(
             "The pruned model was requested, but there is no fresh one.",
@@ -57,8 +62,8 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     _refuse_without_views(config, inputs)
     pruned = "prune" in inputs.folders and config.model != "base"
     frame = choose_frame(config, inputs)
-    if PLAN in config.formats:
-        find_room_frame(inputs, frame)  # refused before anything is written
+    # refused before anything is written
+    room_frame = find_room_frame(inputs, frame) if PLAN in config.formats else None
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
     trained = splats
     if not frame.similarity.is_identity:
@@ -66,8 +71,10 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     model = "pruned" if pruned else "base"
     records = read_records(config, inputs, model)
     fresh = find_fresh(config, inputs, records)
-    exporter = Exporter(config, inputs, out, frame, ctx)
-    splats, changes = exporter.reduce(splats)
+    antialiased = not pruned and _is_antialiased(inputs.folders["train"])
+    source = ExportSource(splats, inputs, frame, ctx, antialiased=antialiased)
+    splats, changes = reduce_scene(
+        splats, config, source, partial(measure_size, config=config, source=source))
     far = describe_bounds(splats)
     if far:
         ctx.notice(far)
@@ -75,11 +82,12 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     others = [name for name in config.formats if name != "ply" and name not in fresh]
     with ctx.progress.bar("export", 2 + len(others), unit="file") as bar:
         write_ply(path, splats, _expected_errors(config, inputs, frame, splats, trained, ctx),
-                  comments=exporter.comments)
+                  comments=describe_scene(nearest_up(frame.up), antialiased=antialiased))
         bar.advance()
         verify_ply(path, splats)
         bar.advance()
-        files, failed = _write_formats(others, exporter, out, splats, bar.advance)
+        writer = FormatWriter(splats, out, config, source, room_frame)
+        files, failed = _write_formats(others, writer, out, bar.advance)
     record = ImportRecord.read(inputs.folders["train"])
     _write_transform(out / TRANSFORM, frame, record.origin if record else None)
     files = {name: dataclasses.replace(file, made_of=made_of(name, config, inputs, model))
@@ -96,15 +104,21 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         own_files=kept.own_files or None, notices=notices or None)
 
 
+def _is_antialiased(train: Path) -> bool:
+    """Returns whether a scene is that of an imported file that says so, and not trained here."""
+    record = ImportRecord.read(train)
+    return bool(record and record.antialiased) and not (train / FINAL).exists()
+
+
 def _write_formats(
-    names: Sequence[str], exporter: Exporter, out: Path, splats: Splats, advance: Callable[[], None]
+    names: Sequence[str], writer: FormatWriter, out: Path, advance: Callable[[], None]
 ) -> tuple[dict[str, ExportedFile], dict[str, FailedFormat]]:
     """Writes the scene in each format; one that fails takes nothing from the others."""
     files: dict[str, ExportedFile] = {}
     failed: dict[str, FailedFormat] = {}
     for name in names:
         try:
-            files[name] = exporter.write(name, splats)
+            files[name] = writer.write(EXPORT_FORMATS[name])
         except WorkspaceError:
             raise
         except ReconError as error:
@@ -115,7 +129,7 @@ def _write_formats(
 
 
 def _notices(kept: KeptFiles) -> tuple[str, ...]:
-    """Returns what the user should know of the files that are kept."""
+    """Returns notices about the files that are kept."""
     return (
         *(f"{file.file} is stale: {file.stale}. It is kept; --format {name} writes it again."
           for name, file in kept.files.items() if file.stale),
@@ -150,7 +164,7 @@ def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
             hint="Run `recon import` with another --frame, or from a file in the right one.")
     if has_views(inputs.folders):
         return
-    refused = [f"--format {name}" for name in config.formats if name in _VIEW_FORMATS]
+    refused = [f"--format {name}" for name in config.formats if EXPORT_FORMATS[name].needs_views]
     if config.drop_floaters:
         refused.append("--drop-floaters")
     if config.max_mb is not None:

@@ -15,13 +15,13 @@ from recon_cli.config.stages import MIN_GAUSSIANS, ImportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, InputError
 from recon_cli.export.import_alignment import Alignment, align_to_views, read_world
-from recon_cli.io.training_scene import load_scene as load_views_of
+from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.splats.axes import AXES
-from recon_cli.splats.loaded import LoadedScene
+from recon_cli.splats.format import LoadedScene
 from recon_cli.splats.ply import write_ply
-from recon_cli.splats.registry import format_of, load_scene
+from recon_cli.splats.registry import format_of, load_splats
 from recon_cli.train.train_data import write_config
 from recon_cli.workspace.digests import digest_file
 from recon_cli.workspace.records import ImportRecord
@@ -32,7 +32,7 @@ def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     """Writes the scene of the one source into `out`.
 
     Raises:
-        FormatError: the file is of no known format, damaged or empty.
+        FormatError: the file is of an unknown format, damaged or empty.
         InputError: several files were given.
     """
     if len(inputs.sources) != 1:
@@ -40,7 +40,7 @@ def run(config: ImportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
             f"{len(inputs.sources)} files were given, but a workspace holds one scene.",
             hint="Import each into a workspace of its own with -w.")
     path = inputs.sources[0]
-    scene = load_scene(path, axes=config.axes if config.axes in AXES else None)
+    scene = load_splats(path, axes=config.axes if config.axes in AXES else None)
     splats = scene.splats
     if not len(splats):
         raise FormatError(f"{path} holds no Gaussians.")
@@ -74,7 +74,7 @@ def _align(
     """
     if not {"ingest", "sfm"} <= inputs.folders.keys():
         return None
-    scene = load_views_of(inputs.folders, validation=config.validation)
+    scene = load_scene(inputs.folders, validation=config.validation)
     return align_to_views(
         splats, scene, read_world(inputs.folders["sfm"]), config.frame, config.max_size, ctx,
         moved=moved)
@@ -89,21 +89,21 @@ def _equivalent_run_config(config: ImportConfig, splats: Splats) -> RunConfig:
 
 
 def _describe(path: Path, scene: LoadedScene, alignment: Alignment | None) -> list[str]:
-    """Returns sentences about what the user has to know of the file."""
-    said = []
+    """Returns notices about the file."""
+    notices = []
     if scene.antialiased:
-        said.append(
+        notices.append(
             f"{path.name} was trained for antialiased rendering (Mip-Splatting), which is not "
-            "supported: what is smaller than a pixel looks too thick")
+            "supported: details smaller than a pixel look too thick")
     if alignment is not None and alignment.doubt and path.suffix.lower() == ".spz":
-        said.append(
-            f"{path.name} may have other axes than it says, or than those of a .ply: try `recon "
+        notices.append(
+            f"{path.name} may have other axes than it states, or than a .ply has: try `recon "
             "import --axes rub`")
     if scene.origin is not None and alignment is None:
-        said.append(
+        notices.append(
             f"{path.name}: {scene.origin.describe()}. Exported files have the new positions; "
             "`recon export --transform` with that translation moves them back, rounded")
-    return said
+    return notices
 
 
 def _summarize(

@@ -1,4 +1,4 @@
-"""What an export wrote, file by file, and what each file was made of.
+"""The record of each exported file, and of the results and options that it was made of.
 
 An export adds to its folder: a file of a format that is not asked for again stays. So every file
 has a record of its own, by which it is fresh or stale whatever the stage's fingerprint says of
@@ -13,61 +13,42 @@ from typing import Any
 
 from recon_cli.errors import ReconstructionError
 from recon_cli.workspace.digests import matches
+from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.summaries import JsonRecord
 
 VERSION = 5  # of the stage; goes up when the meaning of a file changes, and makes the others stale
-CAMERA_FORMATS = ("colmap", "transforms.json")  # of views alone
-# dB that a file may lose on the validation views, unless --max-loss is given; .splat has no
-# harmonics
-MAX_LOSS_DB = {"splat": 3.0}
-_MAX_LOSS_DB = 0.3
 _FRAME = ("scale_between", "transform", "up")
 _SCENE = (*_FRAME, "crop", "drop_floaters", "drop_islands", "drop_backdrop", "sh_degree", "max_mb")
-_MESH = ("max_triangles", "voxel")
-_OWN: Mapping[str, tuple[str, ...]] = {  # options that decide on files of one format alone
-    "spz": ("spz_version",), "sog": ("max_loss",), "lod": ("max_loss",),
-    "mesh.ply": _MESH, "mesh.glb": _MESH, "mesh.obj": _MESH, "plan.svg": _MESH}
-_PATTERNS: Mapping[str, tuple[str, ...]] = {  # of files by format; of others splats.<format>
-    "ply": ("splats.ply", "transform.json"), "lod": ("lod/*",),
-    "colmap": ("sparse/*", "images/*", "colmap/*"),  # colmap/: before version 5
-    "transforms.json": ("transforms.json", "sparse_pc.ply", "images/*"),
-    "plan.svg": ("plan.svg", "measures.json"),
-    **{name: (name,) for name in ("points.ply", "mesh.ply", "mesh.glb", "mesh.obj")}}
 _EARLIER = {"ingest": "other frames", "sfm": "earlier cameras", "train": "an earlier training",
             "prune": "an earlier pruning"}
 
 
-def file_patterns(name: str) -> tuple[str, ...]:
-    """Returns the patterns of the files of a format, relative to the folder of the export."""
-    return _PATTERNS.get(name, (f"splats.{name}",))
-
-
 def owns(name: str, path: str) -> bool:
     """Returns whether a relative path is that of a file of a format."""
-    return matches(path, file_patterns(name))
+    return matches(path, EXPORT_FORMATS[name].patterns)
 
 
 def max_loss_db(name: str, options: Mapping[str, Any]) -> float:
     """Returns how many dB a file of a format may lose on the validation views."""
     given = options["max_loss"]
-    return float(MAX_LOSS_DB.get(name, _MAX_LOSS_DB) if given is None else given)
+    return EXPORT_FORMATS[name].max_loss_db if given is None else float(given)
 
 
 def deciding_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the options of export that decide what a file of a format holds, as JSON values."""
-    own = _own_options(name, options)
-    names = _FRAME if name in CAMERA_FORMATS else _SCENE
-    chosen = {key: options[key] for key in names} | own
+    """Returns the options of export that decide on the files of a format, as JSON values."""
+    names = _FRAME if EXPORT_FORMATS[name].kind == "cameras" else _SCENE
+    chosen = {key: options[key] for key in names} | own_options(name, options)
     return {key: list(value) if isinstance(value, tuple) else value
             for key, value in chosen.items()}
 
 
-def _own_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def own_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Returns those of the deciding options that the fingerprint of the stage leaves out."""
-    own = {key: options[key] for key in _OWN.get(name, ())}
+    row = EXPORT_FORMATS[name]
+    own = {key: options[key] for key in row.options}
     if "max_loss" in own:  # how a .sog shares its colours depends on it
         own["max_loss"] = max_loss_db(name, options)
-    if name not in CAMERA_FORMATS:
+    if row.kind != "cameras":
         own["limited"] = limited_format(options)
     return own
 
@@ -81,7 +62,7 @@ def limited_format(options: Mapping[str, Any]) -> str | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportChange(JsonRecord):
-    """What an option of export removed."""
+    """The Gaussians and dB that an option of export removed."""
 
     option: str
     gaussians: int
@@ -99,7 +80,7 @@ class ExportedFile(JsonRecord):
     bytes: int | None = None  # None, as the next two, for cameras and points
     smaller: float | None = None  # size of the .ply over its size
     psnr_change_db: float | None = None  # on the views that the export is checked on
-    # what it was made of: version, model, digests of stages, options; None: an older version did
+    # sources: version, model, digests of stages, options; None where an older version wrote it
     made_of: Mapping[str, Any] | None = None
     stale: str | None = None  # why it no longer fits the .ply; None where it does
 
@@ -114,7 +95,7 @@ class FailedFormat(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class ExportSummary(JsonRecord):
-    """What export wrote."""
+    """The result of export."""
 
     model: str  # base or pruned
     file: str  # name of the .ply
@@ -137,7 +118,7 @@ class ExportSummary(JsonRecord):
         return tuple(filter(None, reasons))
 
     def _doubt(self, name: str, options: Mapping[str, Any]) -> str:
-        """Returns why the file of a format does not do; empty where it does."""
+        """Returns why the file of a format must be written again; empty if it need not."""
         found, failed = (self.files or {}).get(name), (self.failed or {}).get(name)
         if failed is not None:
             return f"{name} could not be written"
@@ -148,9 +129,9 @@ class ExportSummary(JsonRecord):
         if not loss_is_small(found, max_loss_db(name, options)):
             return f"{found.file} loses more than {max_loss_db(name, options):g} dB"
         made_of = found.made_of or {}
-        before = {key: value for key, value in made_of.items() if key in _own_options(
+        before = {key: value for key, value in made_of.items() if key in own_options(
             name, options)}
-        changed = describe_changes(before, _own_options(name, options))
+        changed = describe_changes(before, own_options(name, options))
         return f"{found.file} is stale: {changed}" if changed else ""
 
     def not_recorded(self) -> tuple[str, ...]:
@@ -174,7 +155,7 @@ def loss_is_small(found: ExportedFile, most: float) -> bool:
 
 
 def describe_changes(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> str:
-    """Returns in words what a file was made of that is not so any more; empty where all is."""
+    """Returns in words which source of a file has changed; empty if none has."""
     if before is None or before.get("version") != now.get("version"):
         return "another version of recon wrote it"
     for key, value in now.items():
@@ -207,4 +188,5 @@ def _number_text(value: Any) -> str:
 
 def main_file(name: str, recorded: str) -> str:
     """Returns the path of the file of a format that is always there."""
-    return f"{recorded}/images.bin" if name == "colmap" else recorded
+    index = EXPORT_FORMATS[name].index
+    return f"{recorded}/{index}" if index else recorded

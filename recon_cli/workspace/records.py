@@ -187,7 +187,7 @@ class ImportRecord(JsonRecord):
     """What is known about an imported scene."""
 
     file: str  # name of the file that it was read from
-    format: str  # of the file, by its name in `io.splats.registry`
+    format: str  # of the file, by its name in `export_formats`
     sha256: str  # of the file
     gaussians: int  # count
     sh_degree: int  # of the colours

@@ -19,10 +19,11 @@ from pathlib import Path
 import click
 
 from recon_cli.scene.splats import Splats, with_rows
-from recon_cli.splats.compressed_ply import read_compressed_ply, write_compressed_ply
+from recon_cli.splats.compressed_ply import write_compressed_ply
 from recon_cli.splats.ply import read_ply, write_ply
+from recon_cli.splats.registry import FORMATS
 from recon_cli.splats.splat import read_splat, write_splat
-from recon_cli.splats.spz import read_spz, write_spz
+from recon_cli.splats.spz import write_spz
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from splat_cases import edge_splats, greatest, rotation_error
@@ -31,13 +32,13 @@ Write, Read = Callable[[Path, Splats], None], Callable[[Path], Splats]
 OURS: list[tuple[str, Write, Read]] = [
     ("a.ply", write_ply, read_ply),
     ("a.splat", write_splat, read_splat),
-    ("3.spz", write_spz, read_spz),
-    ("4.spz", partial(write_spz, version=4), read_spz),
-    ("a.compressed.ply", write_compressed_ply, read_compressed_ply),
+    ("3.spz", write_spz, FORMATS["spz"].read),
+    ("4.spz", partial(write_spz, version=4), FORMATS["spz"].read),
+    ("a.compressed.ply", write_compressed_ply, FORMATS["compressed.ply"].read),
 ]
 THEIRS: list[tuple[str, list[str], Read]] = [
-    ("3.spz", ["--spz-version", "3"], read_spz), ("4.spz", [], read_spz),
-    ("a.compressed.ply", [], read_compressed_ply),
+    ("3.spz", ["--spz-version", "3"], FORMATS["spz"].read), ("4.spz", [], FORMATS["spz"].read),
+    ("a.compressed.ply", [], FORMATS["compressed.ply"].read),
 ]
 
 

@@ -14,7 +14,7 @@ import torch
 
 from recon_cli.cli import main
 from recon_cli.context import EarlierResult
-from recon_cli.export import exporter
+from recon_cli.export import format_writer
 from recon_cli.export.kept_files import keep_files
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import read_ply, write_ply
@@ -139,7 +139,8 @@ def test_an_option_of_one_format_makes_that_one_stale_alone(ws, capsys):
 
 
 def test_a_format_that_loses_too_much_takes_none_of_those_that_pass(ws, capsys, monkeypatch):
-    monkeypatch.setattr(exporter, "max_loss_db", lambda name, _: -1.0 if name == "glb" else 0.5)
+    monkeypatch.setattr(
+        format_writer, "max_loss_db", lambda name, _: -1.0 if name == "glb" else 0.5)
     assert run("export", ws, "--format", "glb,splat") == 5
     err = capsys.readouterr().err
     assert "glb: " in err
@@ -153,7 +154,7 @@ def test_a_format_that_loses_too_much_takes_none_of_those_that_pass(ws, capsys, 
 
 def test_a_file_of_before_stays_where_a_format_fails(ws, monkeypatch):
     before = contents(ws)["splats.spz"]
-    monkeypatch.setattr(exporter, "max_loss_db", lambda _name, _options: -1.0)
+    monkeypatch.setattr(format_writer, "max_loss_db", lambda _name, _options: -1.0)
     assert run("export", ws, "--format", "spz", *BOX) == 5
     assert contents(ws)["splats.spz"] == before
     assert "spz" in stale_files(ws)
@@ -212,7 +213,7 @@ def test_an_export_that_is_interrupted_leaves_all_as_it_was_and_can_be_repeated(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(*((exporter.Exporter, "write") if place == "write" else (
+        patch.setattr(*((format_writer.FormatWriter, "write") if place == "write" else (
             Workspace, "seal")), interrupt)
         assert run("export", ws, "--format", "glb", *BOX) == 130
     assert contents(ws) == before

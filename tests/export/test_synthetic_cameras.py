@@ -34,7 +34,11 @@ def shell(radius=2.0, n=1500):
 @pytest.mark.parametrize("scale", [1e-4, 0.1, 20.0])
 def test_one_gaussian_of_any_size_is_seen(scale):
     one = gaussians([[3.0, 0, 0]], scale=scale)
-    SelfPsnr.of(one, synthetic_scene(one, up=Z_UP, max_size=48), CONTEXT)
+    SelfPsnr.from_renders(one, cameras_of(synthetic_scene(one, up=Z_UP, max_size=48)), CONTEXT)
+
+
+def cameras_of(scene):
+    return [view.camera for view in scene.train]
 
 
 def center(view):
@@ -80,12 +84,12 @@ def test_far_and_faint_gaussians_move_no_camera():
 def test_the_loss_is_that_of_a_scene_which_is_30_db_from_its_photos():
     whole = gaussians(shell(), scale=0.3)
     scene = synthetic_scene(whole, up=Z_UP, max_size=60)
-    found = SelfPsnr.of(whole, scene, CONTEXT)
+    found = SelfPsnr.from_renders(whole, cameras_of(scene), CONTEXT)
     assert found.psnr_db(whole) == pytest.approx(ASSUMED_DB)
     darker = gaussians(shell(), scale=0.3, gray=0.4)
     expected = []
     for camera, before, seen in found.views:
-        change = SelfPsnr.of(darker, scene, CONTEXT).views
+        change = SelfPsnr.from_renders(darker, cameras_of(scene), CONTEXT).views
         after = next(image for other, image, _ in change if other is camera)
         expected.append(-10 * np.log10(1e-3 + ((after - before)[seen] ** 2).mean()))
     assert found.psnr_db(darker) == pytest.approx(np.mean(expected), abs=1e-4)
@@ -94,5 +98,6 @@ def test_the_loss_is_that_of_a_scene_which_is_30_db_from_its_photos():
 
 def test_a_scene_that_nobody_sees_is_refused():
     clear = gaussians(shell(), opacity=0.002)
+    scene = synthetic_scene(clear, up=Z_UP, max_size=60)
     with pytest.raises(ReconstructionError, match="sees anything"):
-        SelfPsnr.of(clear, synthetic_scene(clear, up=Z_UP, max_size=60), CONTEXT)
+        SelfPsnr.from_renders(clear, cameras_of(scene), CONTEXT)

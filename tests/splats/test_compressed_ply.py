@@ -15,7 +15,7 @@ from splat_cases import N, damaged, edge_splats, greatest, read_or_refused, rota
 from recon_cli.errors import FormatError
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, joined, with_rows
-from recon_cli.splats.compressed_ply import read_compressed_ply, write_compressed_ply
+from recon_cli.splats.compressed_ply import FORMAT, load_compressed_ply, write_compressed_ply
 from recon_cli.splats.values import compact_order, morton_order
 
 
@@ -62,7 +62,7 @@ def test_points_in_morton_order_are_near_their_neighbours():
 def test_each_parameter_is_within_half_a_step(tmp_path, degree, colored):
     splats = edge_splats(degree, colored)
     write_compressed_ply(tmp_path / "a.compressed.ply", splats)
-    back, splats = read_compressed_ply(tmp_path / "a.compressed.ply"), in_order(splats)
+    back, splats = load_compressed_ply(tmp_path / "a.compressed.ply").splats, in_order(splats)
     assert back.sh_degree == degree
     for name, bits in (("means", [11, 10, 11]), ("log_scales", [11, 10, 11])):
         value = getattr(splats, name)
@@ -82,7 +82,7 @@ def test_coefficients_at_the_ends_are_within_a_step_and_beyond_are_clamped(tmp_p
     splats = few(5, 1)
     splats.sh_rest[:, 0, 0] = torch.tensor([-4, -3.97, 3.99, -9, 9])
     write_compressed_ply(tmp_path / "a.ply", splats)
-    back = read_compressed_ply(tmp_path / "a.ply")
+    back = load_compressed_ply(tmp_path / "a.ply").splats
     wanted = in_order(splats).sh_rest[:, 0, 0].clamp(-4, 4)
     assert greatest(back.sh_rest[:, 0, 0], wanted) <= 1 / 32
 
@@ -92,7 +92,7 @@ def test_gaussians_without_harmonics_do_not_tint_the_scene(tmp_path):
     splats = edge_splats(3, 1)
     splats.sh_rest[:] = 0
     write_compressed_ply(tmp_path / "a.ply", splats)
-    back = read_compressed_ply(tmp_path / "a.ply")
+    back = load_compressed_ply(tmp_path / "a.ply").splats
     assert back.sh_rest.abs().unique().tolist() == [1 / 64]
     assert (back.sh_rest.mean(dim=0) == 0).all()
 
@@ -126,13 +126,13 @@ def test_a_file_without_bounds_of_colours_is_read(tmp_path):
     path = tmp_path / "a.ply"
     splats = few(9, 0)
     write_compressed_ply(path, splats)
-    back = read_compressed_ply(path)
+    back = load_compressed_ply(path).splats
     head, data = path.read_bytes().split(b"end_header\n", 1)
     head = re.sub(rb"property float (min|max)_[rgb]\n", b"", head)
     words = np.frombuffer(data, "<u4", 36, 72).reshape(9, 4).copy()
     words[:, 3] = 255 << 24 | 51 << 8 | 128
     path.write_bytes(head + b"end_header\n" + data[:48] + words.tobytes())
-    plain = read_compressed_ply(path)
+    plain = load_compressed_ply(path).splats
     assert torch.equal(plain.means, back.means)
     assert np.allclose(SH_C0 * plain.sh_dc + 0.5, [1, 0, 0.2], atol=1e-6)
     assert np.allclose(plain.opacities, 128 / 255)
@@ -143,7 +143,7 @@ def test_what_does_not_fit_is_refused_and_tiny_scales_are_clamped(tmp_path):
     splats = few()
     splats.log_scales[4] = -1000
     write_compressed_ply(path, splats)
-    assert read_compressed_ply(path).log_scales.min() == -20
+    assert load_compressed_ply(path).splats.log_scales.min() == -20
     splats.log_scales[4] = 21
     for bad, message in [
             (splats, "1 Gaussians are too large"), (splats.select(torch.arange(0)), "no Gaussians"),
@@ -154,19 +154,19 @@ def test_what_does_not_fit_is_refused_and_tiny_scales_are_clamped(tmp_path):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (lambda _: b"", "no .ply"),
+    (lambda _: b"", "not a .ply"),
     (lambda data: data[:-1], "truncated"),
     (lambda data: data + b"1", "truncated or damaged"),
     (lambda data: data.replace(b"vertex 9", b"vertex 9000000000"), "truncated"),
     (lambda data: data.replace(b"chunk 1", b"chunk 2").replace(b"end_header\n", (
         b"end_header\n" + bytes(72))), "2 chunks of 256 for 9"),
-    (lambda data: data.replace(b"packed_scale", b"scale"), "no compressed"),
-    (lambda data: data.replace(b"min_y", b"min_w"), "no compressed"),
-    (lambda data: data.replace(b"min_g", b"min_q"), "no compressed"),
-    (lambda data: data.replace(b"uint packed_scale", b"float packed_scale"), "no compressed"),
-    (lambda data: data.replace(b"sh 9", b"sh 8")[:-9], "do not make a degree"),
-    (lambda data: data.replace(b"uchar f_rest_8", b"char f_rest_8"), "do not make a degree"),
-    (lambda data: data.replace(b"f_rest_8", b"f_rest_9"), "do not make a degree"),
+    (lambda data: data.replace(b"packed_scale", b"scale"), "not a compressed"),
+    (lambda data: data.replace(b"min_y", b"min_w"), "not a compressed"),
+    (lambda data: data.replace(b"min_g", b"min_q"), "not a compressed"),
+    (lambda data: data.replace(b"uint packed_scale", b"float packed_scale"), "not a compressed"),
+    (lambda data: data.replace(b"sh 9", b"sh 8")[:-9], "do not fill a degree"),
+    (lambda data: data.replace(b"uchar f_rest_8", b"char f_rest_8"), "do not fill a degree"),
+    (lambda data: data.replace(b"f_rest_8", b"f_rest_9"), "do not fill a degree"),
     (lambda data: data.replace(b"binary_little_endian", b"ascii"), "truncated or damaged"),
     (lambda data: data.replace(b"end_header\n", b"end_header\n" + b"\xff" * 4, 1)[:-4],
      "not finite in means"),
@@ -184,7 +184,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message):
     tracemalloc.start()
     try:
         with pytest.raises(FormatError, match=message):
-            read_compressed_ply(path)
+            load_compressed_ply(path)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
@@ -195,7 +195,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message):
 def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed, degree):
     path = tmp_path_factory.getbasetemp() / "fuzz.compressed.ply"
     write_compressed_ply(path, few(4, degree))
-    read_or_refused(read_compressed_ply, path, damaged(path.read_bytes(), seed))
+    read_or_refused(FORMAT.read, path, damaged(path.read_bytes(), seed))
 
 
 def test_what_lies_far_outside_takes_no_bits_from_the_rest(tmp_path):
@@ -203,7 +203,7 @@ def test_what_lies_far_outside_takes_no_bits_from_the_rest(tmp_path):
     far = random_splats(300, seed=1, dtype=torch.float32)
     far.means *= 1000 / far.means.norm(dim=1, keepdim=True)
     write_compressed_ply(tmp_path / "a.compressed.ply", joined([far, near])[0])
-    back = read_compressed_ply(tmp_path / "a.compressed.ply").means
+    back = load_compressed_ply(tmp_path / "a.compressed.ply").splats.means
     rooms = back[back.norm(dim=1) < 100]
     assert len(rooms) == 1000
     apart = torch.cdist(near.means, rooms).amin(1)
@@ -232,7 +232,7 @@ def test_a_small_opaque_gaussian_keeps_its_place_when_a_chunk_far_away_is_filled
     far = random_splats(300, seed=1, dtype=torch.float32)
     far.means *= 1000 / far.means.norm(dim=1, keepdim=True)
     write_compressed_ply(tmp_path / "a.compressed.ply", joined([far, near])[0])
-    back = read_compressed_ply(tmp_path / "a.compressed.ply").means
+    back = load_compressed_ply(tmp_path / "a.compressed.ply").splats.means
     assert (torch.cdist(near.means[:300], back).amin(1) < 0.01).all()
 
 
@@ -250,6 +250,6 @@ def test_rounded_harmonics_leave_the_mean_colour_over_the_cameras_as_it_was(tmp_
     for name, places in (("known", centers), ("unknown", None)):
         path = tmp_path / f"{name}.compressed.ply"
         write_compressed_ply(path, splats, centers=places)
-        off = mean_colors(read_compressed_ply(path)) - mean_colors(in_order(splats))
+        off = mean_colors(load_compressed_ply(path).splats) - mean_colors(in_order(splats))
         rms.append(float(off.square().mean().sqrt()))
     assert rms[0] < 0.5 * rms[1]

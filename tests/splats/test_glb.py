@@ -14,7 +14,7 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.render.registry import render
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, transformed
-from recon_cli.splats.glb import Y_DOWN, Y_UP, Z_UP, nearest_axes, pack_glb, read_glb, write_glb
+from recon_cli.splats.glb import Y_DOWN, Y_UP, Z_UP, load_glb, nearest_axes, pack_glb, write_glb
 
 EXT = "KHR_gaussian_splatting"
 EXACT = 1e-6
@@ -62,7 +62,7 @@ def assert_same(splats, back):
 def test_a_scene_comes_back_as_it_was(tmp_path, make, axes):
     splats = make()
     write_glb(tmp_path / "a.glb", splats, axes=axes)
-    assert_same(splats, read_glb(tmp_path / "a.glb", axes=axes))
+    assert_same(splats, load_glb(tmp_path / "a.glb", axes=axes).splats)
 
 
 @pytest.mark.parametrize("colored", [0, 1, 12, 30])
@@ -70,7 +70,7 @@ def test_a_scene_comes_back_as_it_was(tmp_path, make, axes):
 def test_any_degree_and_share_comes_back(tmp_path, degree, colored):
     splats = with_harmonics(archive_splats.room(30), degree, colored)
     write_glb(tmp_path / "a.glb", splats)
-    back = read_glb(tmp_path / "a.glb")
+    back = load_glb(tmp_path / "a.glb").splats
     assert back.sh_degree == (degree if colored else 0)
     assert_same(splats if degree and colored else with_harmonics(splats, 0, 0), back)
 
@@ -131,7 +131,7 @@ def test_the_container_is_what_its_format_says(tmp_path):
 def test_a_camera_that_turns_with_the_world_sees_the_same(tmp_path):
     splats, camera = archive_splats.room(400), camera_at()
     write_glb(tmp_path / "a.glb", splats)
-    there = read_glb(tmp_path / "a.glb", axes=UNTURNED)  # as the file has it
+    there = load_glb(tmp_path / "a.glb", axes=UNTURNED).splats  # as the file has it
     turned = Similarity(rotation=Z_UP).camera(camera)
     images = [render(one, at, torch.zeros(3), 3).rgb
               for one, at in ((splats, camera), (there, turned))]
@@ -149,7 +149,7 @@ def test_nodes_place_their_gaussians(tmp_path):
             {"mesh": 0, "rotation": [0, 0, np.sqrt(0.5), np.sqrt(0.5)]}]
 
     changed(tmp_path / "a.glb", nest)
-    back = read_glb(tmp_path / "a.glb", axes=UNTURNED)
+    back = load_glb(tmp_path / "a.glb", axes=UNTURNED).splats
     wanted = transformed(splats, Similarity(
         2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3])))
     torch.testing.assert_close(back.means, wanted.means, rtol=1e-6, atol=1e-6)
@@ -160,10 +160,10 @@ def test_nodes_place_their_gaussians(tmp_path):
 
 def test_a_matrix_of_a_node_is_read_by_columns(tmp_path):
     write_glb(tmp_path / "a.glb", archive_splats.room(5), axes=UNTURNED)
-    before = read_glb(tmp_path / "a.glb", axes=UNTURNED)
+    before = load_glb(tmp_path / "a.glb", axes=UNTURNED).splats
     changed(tmp_path / "a.glb", lambda value: value["nodes"][0].update(
         matrix=[0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]))
-    back = read_glb(tmp_path / "a.glb", axes=UNTURNED)
+    back = load_glb(tmp_path / "a.glb", axes=UNTURNED).splats
     x, y, z = before.means.T
     torch.testing.assert_close(back.means, torch.stack([5 - y, 6 + x, 7 + z], dim=1))
 
@@ -182,7 +182,7 @@ def test_two_primitives_become_one_scene(tmp_path):
         value["scenes"][0]["nodes"] = [0, 1]
 
     changed(tmp_path / "a.glb", twice)
-    back = read_glb(tmp_path / "a.glb")
+    back = load_glb(tmp_path / "a.glb").splats
     assert len(back) == 40
     assert len(back.sh_rest) == 20
     assert_same(splats, back.select(torch.arange(20)))
@@ -201,7 +201,7 @@ def test_rotations_in_few_bits_are_read(tmp_path, component, kind, most):
     value["bufferViews"][at] |= {"byteOffset": len(data), "byteLength": len(packed)}
     value["buffers"][0]["byteLength"] += len(packed)
     (tmp_path / "a.glb").write_bytes(pack_glb(value, data + packed))
-    back = read_glb(tmp_path / "a.glb", axes=UNTURNED)
+    back = load_glb(tmp_path / "a.glb", axes=UNTURNED).splats
     assert archive_splats.apart(back.quats, splats.quats).max() < 1.5 / most
 
 
@@ -223,7 +223,7 @@ def test_a_file_without_gaussians_is_refused(tmp_path):
     changed(tmp_path / "a.glb", lambda value: value["meshes"][0]["primitives"][0].pop(
         "extensions"))
     with pytest.raises(FormatError, match="no Gaussians"):
-        read_glb(tmp_path / "a.glb")
+        load_glb(tmp_path / "a.glb")
 
 
 @pytest.mark.parametrize(("up", "axes"), [
@@ -237,7 +237,7 @@ def test_axes_go_by_where_up_is(up, axes):
 def test_a_file_says_which_axes_the_scene_had(axes, tmp_path):
     splats = archive_splats.room(40)
     write_glb(tmp_path / "x.glb", splats, axes=axes)
-    back = read_glb(tmp_path / "x.glb")
+    back = load_glb(tmp_path / "x.glb").splats
     assert torch.allclose(back.means, splats.means, atol=1e-5)
 
 
@@ -245,5 +245,6 @@ def test_axes_that_a_file_cannot_name_are_asked_for(tmp_path):
     turned = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
     splats = archive_splats.room(40)
     write_glb(tmp_path / "x.glb", splats, axes=turned)
-    assert torch.allclose(read_glb(tmp_path / "x.glb", axes=turned).means, splats.means, atol=1e-5)
-    assert not torch.allclose(read_glb(tmp_path / "x.glb").means, splats.means, atol=0.1)
+    back = load_glb(tmp_path / "x.glb", axes=turned).splats
+    assert torch.allclose(back.means, splats.means, atol=1e-5)
+    assert not torch.allclose(load_glb(tmp_path / "x.glb").splats.means, splats.means, atol=0.1)

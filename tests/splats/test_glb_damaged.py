@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from recon_cli.errors import FormatError
-from recon_cli.splats.glb import pack_glb, read_glb, write_glb
+from recon_cli.splats.glb import load_glb, pack_glb, write_glb
 
 EXT = "KHR_gaussian_splatting"
 COUNT = 20
@@ -40,7 +40,7 @@ def edited(good, edit):
 def refused(tmp_path, data, said):
     (tmp_path / "a.glb").write_bytes(data)
     with pytest.raises(FormatError, match=said), damage.little_memory():
-        read_glb(tmp_path / "a.glb")
+        load_glb(tmp_path / "a.glb")
 
 
 def head(length, *chunks):
@@ -55,19 +55,19 @@ def of(value, group, name):
 
 
 @pytest.mark.parametrize(("data", "said"), [
-    (b"", "no .glb"), (b"glTF", "no .glb"), (b"PK\x03\x04" + bytes(50), "no .glb"),
+    (b"", "not a .glb"), (b"glTF", "not a .glb"), (b"PK\x03\x04" + bytes(50), "not a .glb"),
     (struct.pack("<4sIIII", b"glTF", 1, 20, 0, 0), "version 1"),
     (head(1 << 31, (b"JSON", b"{} ")), "header promises 2147483648"),
     (head(10, (b"JSON", b"{} ")), "header promises 10"),
     (head(None, (b"BIN\0", b"{} ")), "needed is JSON"),
     (head(None, (b"JSON", b"{}  "), (b"JSON", b"{}  ")), "needed is BIN"),
-    (head(None, (b"JSON", b"[]  ")), "it is no object"),
+    (head(None, (b"JSON", b"[]  ")), "not an object"),
     (head(None, (b"JSON", b"{}  ")), "no scenes 0"),
     (head(None, (b"JSON", b"{")), "cannot be read"),
     (head(None, (b"JSON", b"\xff\xff")), "cannot be read"),
     (head(None, (b"JSON", b"[" * 100_000)), "cannot be read"),
     (head(None, (b"JSON", b'{"a":' * 100_000)), "cannot be read"),
-    (head(None, (b"JSON", b'{"a":NaN}')), "NaN is no number"),
+    (head(None, (b"JSON", b'{"a":NaN}')), "NaN is not a number"),
     (head(None, (b"JSON", b"9" * 5000)), "cannot be read"),
     (head(None, (b"JSON", b"[" + b"{}," * 2_000_000 + b"0]")), "6000003 bytes, needed is JSON"),
     (struct.pack("<4sIII4s", b"glTF", 2, 20, 1 << 31, b"JSON"), "ends after the file"),
@@ -80,7 +80,7 @@ def test_what_is_no_glb_is_refused(tmp_path, data, said):
 
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(FormatError, match="cannot be read"):
-        read_glb(tmp_path / "none.glb")
+        load_glb(tmp_path / "none.glb")
 
 
 @pytest.mark.parametrize(("key", "number", "said"), [
@@ -145,7 +145,7 @@ def test_a_scene_that_is_none_is_refused(tmp_path, good, edit, said):
     data = edited(good, edit)
     if said is None:  # unusual, and fine
         (tmp_path / "a.glb").write_bytes(data)
-        assert len(read_glb(tmp_path / "a.glb")) == COUNT
+        assert len(load_glb(tmp_path / "a.glb").splats) == COUNT
     else:
         refused(tmp_path, data, said)
 
@@ -176,11 +176,11 @@ def test_a_gaussian_that_is_not_finite_is_left_out_and_counted(
     value, data = good
     pack = tmp_path / "good.glb"
     pack.write_bytes(pack_glb(value, data))
-    whole = read_glb(pack)
+    whole = load_glb(pack).splats
     start = of(value, "bufferViews", name)["byteOffset"]
     data = data[:start] + np.array([number], "<f4").tobytes() + data[start + 4:]
     pack.write_bytes(pack_glb(value, data))
-    left = read_glb(pack)
+    left = load_glb(pack).splats
     assert torch.equal(left.means, whole.means[1:])
     assert torch.equal(left.sh_dc, whole.sh_dc[1:])
     assert f"1 of {len(whole)} Gaussians are left out" in caplog.text
@@ -199,7 +199,7 @@ def test_nans_that_signal_are_refused_without_a_warning_where_most_are_bad(tmp_p
 def _survives(path, data):
     path.write_bytes(data)
     with contextlib.suppress(FormatError):
-        splats = read_glb(path)
+        splats = load_glb(path).splats
         assert all(value.isfinite().all() for value in splats.parameters().values())
 
 

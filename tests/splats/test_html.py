@@ -19,7 +19,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.splats.axes import turn_from
 from recon_cli.splats.html import default_view, read_html, write_html
-from recon_cli.splats.spz import read_spz, spz_bytes
+from recon_cli.splats.spz import load_spz, spz_bytes
 
 Y_DOWN = np.array([0.0, -1, 0])
 HOSTILE = '</script><script>alert(1)</script>"><img src=x onerror=alert(2)><!-- $scene &lt; \u2028'
@@ -76,7 +76,7 @@ def test_a_page_reads_back_as_the_spz_of_the_same_scene(tmp_path, degree):
         tmp_path / "a.spz", turn_from("rub", splats), harmonic_step=1, axes=None)
     (tmp_path / "a.spz").write_bytes(finest)
     page = read_html(tmp_path / "a.html")
-    spz = read_spz(tmp_path / "a.spz", axes="rub")
+    spz = load_spz(tmp_path / "a.spz", axes="rub").splats
     assert torch.allclose(page.means, splats.means, atol=1e-3)
     for name, value in spz.parameters().items():
         assert torch.equal(getattr(page, name), value), name
@@ -231,11 +231,11 @@ def with_scene(make):
     (lambda text: re.sub('data-bytes="[0-9]+"', 'data-bytes="999999999999"', text),
      "999999999999 bytes, but holds"),
     (with_scene(lambda scene: scene[:-8]), "promises a scene of"),
-    (with_scene(lambda scene: scene[:-2]), "no base64"),
-    (with_scene(lambda scene: "*" + scene[1:]), "no base64"),
-    (with_scene(lambda scene: scene[:40] + "\n" + scene[40:]), "no base64"),
+    (with_scene(lambda scene: scene[:-2]), "not base64"),
+    (with_scene(lambda scene: "*" + scene[1:]), "not base64"),
+    (with_scene(lambda scene: scene[:40] + "\n" + scene[40:]), "not base64"),
     (with_scene(lambda scene: base64.b64encode(
-        b"PK" + base64.b64decode(scene)[2:]).decode()), "no SPZ"),
+        b"PK" + base64.b64decode(scene)[2:]).decode()), "not an SPZ"),
 ])
 def test_damaged_and_lying_pages_are_refused_with_the_reason(written, change, message):
     written.write_text(change(written.read_text(encoding="utf-8")), encoding="utf-8")

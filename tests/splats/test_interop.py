@@ -6,10 +6,10 @@ import torch
 from splat_cases import greatest, rotation_error
 
 from recon_cli.scene.splats import SH_C0
-from recon_cli.splats.compressed_ply import read_compressed_ply
+from recon_cli.splats.compressed_ply import load_compressed_ply
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.splat import read_splat
-from recon_cli.splats.spz import read_spz
+from recon_cli.splats.spz import load_spz
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def minimal(shared_data):
 
 def test_one_scene_as_ply_and_spz_agrees_within_the_steps_of_spz(points):
     # made by Niantic's program, which turns the axes and does not say so
-    ply, spz = read_ply(points("ply")), read_spz(points("spz"), axes="rub")
+    ply, spz = read_ply(points("ply")), load_spz(points("spz"), axes="rub").splats
     assert greatest(ply.means, spz.means) <= 0.5 / 4096 + 1e-7
     assert greatest(ply.log_scales, spz.log_scales) <= 0.5 / 16 + 1e-6
     assert greatest(ply.opacities, spz.opacities) <= 0.5 / 255 + 1e-6
@@ -52,7 +52,7 @@ def test_one_scene_as_ply_and_splat_agrees_within_the_steps_of_splat(points):
 
 
 def test_a_file_without_gzip_is_the_one_with_it(minimal):
-    packed, raw = read_spz(minimal / "minimal-v2.spz"), read_spz(minimal / "minimal-raw.spz")
+    packed, raw = (load_spz(minimal / f"minimal-{name}.spz").splats for name in ("v2", "raw"))
     for name, value in packed.parameters().items():
         assert torch.equal(value, getattr(raw, name)), name
 
@@ -61,12 +61,12 @@ def test_four_points_on_a_square_are_one_scene_in_every_version(minimal):
     splat = read_splat(minimal / "minimal.splat")
     assert splat.means.tolist() == [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]]
     for version in (3, 4):
-        spz = read_spz(minimal / f"minimal-v{version}.spz", axes="rub")
+        spz = load_spz(minimal / f"minimal-v{version}.spz", axes="rub").splats
         assert torch.equal(spz.means, splat.means)
         assert spz.quats.tolist() == [[1, 0, 0, 0]] * 4
         assert greatest(spz.log_scales, splat.log_scales) <= 0.5 / 16
         assert torch.equal(spz.logit_opacities, splat.logit_opacities)
-    two = read_spz(minimal / "minimal-v2.spz")  # made without turning the axes
+    two = load_spz(minimal / "minimal-v2.spz").splats  # made without turning the axes
     assert torch.equal(two.means, splat.means)
     assert rotation_error(two, spz) <= 0.5 / 127.5 + 1e-6
 
@@ -77,8 +77,8 @@ def biker(shared_data):
 
 
 def test_a_scene_of_150_thousand_agrees_as_spz_and_compressed_ply(biker):
-    spz = read_spz(biker / "biker.spz", axes="rub")  # which the file does not name
-    ply = read_compressed_ply(biker / "biker.compressed.ply")
+    spz = load_spz(biker / "biker.spz", axes="rub").splats  # which the file does not name
+    ply = load_compressed_ply(biker / "biker.compressed.ply").splats
     assert len(spz) == len(ply) == 152746
     # SPZ was made of the compressed .ply: its half steps are all the difference.
     assert greatest(spz.means, ply.means) <= 0.5 / 4096 + 1e-6
@@ -89,7 +89,7 @@ def test_a_scene_of_150_thousand_agrees_as_spz_and_compressed_ply(biker):
 
 
 def test_larger_files_of_other_programs_are_read(shared_data, biker):
-    guitar = read_compressed_ply(biker / "guitar.compressed.ply")
+    guitar = load_compressed_ply(biker / "guitar.compressed.ply").splats
     assert (len(guitar), guitar.sh_degree) == (90854, 0)
     model = read_splat(shared_data / "interop" / "splat-viewer" / "model.splat")
     assert len(model) == 124495

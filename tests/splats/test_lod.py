@@ -12,7 +12,7 @@ from recon_cli.errors import FormatError
 from recon_cli.splats import lod
 from recon_cli.splats.lod import make_levels, read_lod, write_lod
 from recon_cli.splats.registry import read_splats
-from recon_cli.splats.sog import Unpacked, read_files, read_sog, write_sog
+from recon_cli.splats.sog import Unpacked, load_sog, read_files, write_sog
 
 
 @pytest.fixture(autouse=True)
@@ -86,7 +86,7 @@ def test_the_scene_comes_back_as_exactly_as_from_a_sog(tmp_path):
     splats = archive_splats.room(2000)
     written(tmp_path, splats)
     write_sog(tmp_path / "a.sog", splats)
-    back, same = read_splats(tmp_path / "lod-meta.json"), read_sog(tmp_path / "a.sog")
+    back, same = read_splats(tmp_path / "lod-meta.json"), load_sog(tmp_path / "a.sog").splats
     rows, others = archive_splats.matched(splats, back), archive_splats.matched(splats, same)
     for name, tolerance in (("means", 1e-4), ("quats", 0.02), ("log_scales", 0.02),
                             ("sh_dc", 0.02)):
@@ -154,9 +154,9 @@ DAMAGES = {
     "a range beyond the file": lambda meta: _first_leaf(meta).update(count=2**31),
     "a range twice": lambda meta: leaves(meta["tree"])[1]["lods"].update({"0": _first_leaf(meta)}),
     "no count": lambda meta: _first_leaf(meta).pop("count"),
-    "a level that is no number": lambda meta: leaves(meta["tree"])[0].update(lods={"fine": {}}),
-    "children that are no list": lambda meta: meta["tree"].update(children={}),
-    "a child that is no node": lambda meta: meta["tree"]["children"].append(3),
+    "a level that is not a number": lambda meta: leaves(meta["tree"])[0].update(lods={"fine": {}}),
+    "children that are not a list": lambda meta: meta["tree"].update(children={}),
+    "a child that is not a node": lambda meta: meta["tree"]["children"].append(3),
     "a tree without leaves": lambda meta: meta.update(tree={}),
 }
 

@@ -9,7 +9,7 @@ import torch
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import SH_C0
 from recon_cli.splats.ply import load_ply, read_ply, write_ply
-from recon_cli.splats.registry import load_scene, read_splats
+from recon_cli.splats.registry import load_splats, read_splats
 
 N = 300
 KINDS = {"float": "<f4", "double": "<f8", "uchar": "u1", "ushort": "<u2"}
@@ -82,7 +82,7 @@ def test_doubles_far_away_are_moved_to_the_origin_before_they_are_rounded(tmp_pa
     assert np.abs(scene.splats.means.numpy() + scene.origin.point - means(table)).max() < 1e-6
     assert scene.origin.rounding == 0.25
     assert not scene.origin.rounded
-    turned = load_scene(path, axes="rub")
+    turned = load_splats(path, axes="rub")
     assert np.allclose(turned.origin.point, scene.origin.point * np.array([1, -1, -1]))
 
 

@@ -5,7 +5,8 @@ import torch
 from archive_splats import room
 
 from recon_cli.errors import FormatError
-from recon_cli.splats.registry import FORMATS, format_of, read_splats, scene_file
+from recon_cli.splats.registry import FORMATS, format_of, read_splats
+from recon_cli.workspace.export_formats import EXPORT_FORMATS
 
 pytestmark = pytest.mark.floors
 
@@ -27,7 +28,7 @@ def test_a_file_under_the_name_of_another_format_is_refused(name, tmp_path):
     path = tmp_path / "room"
     FORMATS[name].write(path, room(40, degree=0))
     for other in FORMATS.keys() - {name, "splat"}:
-        renamed = scene_file(tmp_path, other)
+        renamed = tmp_path / EXPORT_FORMATS[other].file
         renamed.parent.mkdir(exist_ok=True)
         renamed.write_bytes(path.read_bytes())
         with pytest.raises(FormatError) as caught:
@@ -36,6 +37,6 @@ def test_a_file_under_the_name_of_another_format_is_refused(name, tmp_path):
 
 
 def test_an_unknown_ending_is_refused_with_those_that_are_known(tmp_path):
-    with pytest.raises(FormatError, match="no known format") as caught:
+    with pytest.raises(FormatError, match="known format") as caught:
         read_splats(tmp_path / "room.ksplat")
     assert ".spz" in caught.value.hint

@@ -14,7 +14,7 @@ from scenes import camera_at, with_harmonics
 from recon_cli.errors import InputError
 from recon_cli.render.registry import render
 from recon_cli.splats.ply import write_ply
-from recon_cli.splats.sog import encode_webp, read_sog, write_sog
+from recon_cli.splats.sog import encode_webp, load_sog, write_sog
 
 ROUNDING = 1e-6  # of float32, of values about 1
 LONG = np.sqrt(2) / 255 / 2  # half a step of a component of a quaternion
@@ -22,7 +22,7 @@ LONG = np.sqrt(2) / 255 / 2  # half a step of a component of a quaternion
 
 def there_and_back(tmp_path, splats):
     write_sog(tmp_path / "a.sog", splats)
-    return read_sog(tmp_path / "a.sog")
+    return load_sog(tmp_path / "a.sog").splats
 
 
 def meta_of(path):
@@ -86,7 +86,7 @@ def test_a_scene_of_degree_0_has_no_palette(tmp_path):
                          ("b", archive_splats.room(50, degree=0))):
         write_sog(tmp_path / f"{name}.sog", splats)
         assert "shN" not in meta_of(tmp_path / f"{name}.sog")
-        assert read_sog(tmp_path / f"{name}.sog").sh_degree == 0
+        assert load_sog(tmp_path / f"{name}.sog").splats.sh_degree == 0
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 63, 64, 65, 257])

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from recon_cli.errors import FormatError
-from recon_cli.splats.sog import encode_webp, read_sog, write_sog
+from recon_cli.splats.sog import encode_webp, load_sog, write_sog
 
 COUNT = 70  # a palette of 5, images of 9 x 8
 
@@ -64,7 +64,7 @@ def claimed(width, height):
 def read(tmp_path, data):
     (tmp_path / "a.sog").write_bytes(data)
     with damage.little_memory():
-        return read_sog(tmp_path / "a.sog")
+        return load_sog(tmp_path / "a.sog").splats
 
 
 def refused(tmp_path, data, said):
@@ -78,14 +78,14 @@ def test_what_is_changed_below_is_whole(tmp_path, good):
 
 
 @pytest.mark.parametrize(("data", "said"), [
-    (b"", "no .sog"), (b"ply\n", "no .sog"), (b"PK\x03\x04" + bytes(50), "no .sog"),
-    (pack({}), "no .sog"), (pack({"a": ""}), "no entry 'meta.json'"),
+    (b"", "not a .sog"), (b"ply\n", "not a .sog"), (b"PK\x03\x04" + bytes(50), "not a .sog"),
+    (pack({}), "not a .sog"), (pack({"a": ""}), "no entry 'meta.json'"),
     (pack({"meta.json": "{"}), "cannot be read"),
     (pack({"meta.json": "[" * 100_000}), "cannot be read"),
     (pack({"meta.json": '{"version":' + "9" * 5000 + "}"}), "cannot be read"),
-    (pack({"meta.json": "[]"}), "it is no object"), (pack({"meta.json": "{}"}), "version = None"),
+    (pack({"meta.json": "[]"}), "not an object"), (pack({"meta.json": "{}"}), "version = None"),
     (pack({"meta.json": b"\xff\xfe"}), "cannot be read"),
-    (pack({"meta.json": '{"version": 2, "count": NaN}'}), "NaN is no number"),
+    (pack({"meta.json": '{"version": 2, "count": NaN}'}), "NaN is not a number"),
     (pack({"meta.json": '{"means": {"shape": [1, 3]}}'}), "version 1"),
     (pack({"meta.json": '{"version": 3}'}), "version 3"),
     (pack({"meta.json": " " * (2 << 20)}), "more than 1048576 bytes"),
@@ -97,7 +97,7 @@ def test_what_is_no_sog_is_refused(tmp_path, data, said):
 
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(FormatError, match="cannot be read"):
-        read_sog(tmp_path / "none.sog")
+        load_sog(tmp_path / "none.sog")
 
 
 @pytest.mark.parametrize("name", [
@@ -127,7 +127,7 @@ def test_a_size_in_the_directory_that_is_a_lie_is_refused(tmp_path, good, claime
     data = bytearray(pack({**good, "sh0.webp": bytes(64 << 20)}))
     at = data.rindex(b"PK\x01\x02", 0, data.rindex(b"sh0.webp"))
     struct.pack_into("<I", data, at + 24, claimed)
-    refused(tmp_path, bytes(data), "cannot be unpacked|unpacks to more|no image")
+    refused(tmp_path, bytes(data), "cannot be unpacked|unpacks to more|not an image")
 
 
 def test_a_wrong_checksum_is_refused(tmp_path, good):
@@ -147,11 +147,11 @@ def test_a_missing_entry_is_refused(tmp_path, good, name):
     ("scales.webp", plain(8, 9), "8x9 pixels, needed are 9x8"),
     ("quats.webp", claimed(16383, 16383), "16383x16383 pixels for 70"),
     ("means_l.webp", claimed(16383, 16383), "16383x16383 pixels for 70"),
-    ("means_l.webp", claimed(1000, 1000), "needed are 1000x1000|no image"),
+    ("means_l.webp", claimed(1000, 1000), "needed are 1000x1000|not an image"),
     ("shN_centroids.webp", plain(64 * 8, 1), "512x1 pixels for 960"),
     ("shN_centroids.webp", plain(64 * 15, 2), "960x2 pixels, needed are 960x1"),
-    ("sh0.webp", b"RIFF1234WEBPVP8Lxxxx", "no image"), ("sh0.webp", b"", "no image"),
-    ("sh0.webp", b"GIF89a" + bytes(20), "no image"),
+    ("sh0.webp", b"RIFF1234WEBPVP8Lxxxx", "not an image"), ("sh0.webp", b"", "not an image"),
+    ("sh0.webp", b"GIF89a" + bytes(20), "not an image"),
     ("quats.webp", plain(9, 8, 4), "without their greatest"),
     ("shN_labels.webp", plain(9, 8, 3, 255), "label 65535 of a palette"),
 ])
@@ -169,7 +169,7 @@ def test_an_animation_is_refused(tmp_path, good):
     frames = [Image.fromarray(np.full((8, 9, 3), value, np.uint8)) for value in (0, 200)]
     moving = io.BytesIO()
     frames[0].save(moving, "WEBP", lossless=True, save_all=True, append_images=frames[1:])
-    refused(tmp_path, pack({**good, "sh0.webp": moving.getvalue()}), "no single image")
+    refused(tmp_path, pack({**good, "sh0.webp": moving.getvalue()}), "not a single image")
 
 
 def test_images_may_be_png(tmp_path, good):
@@ -220,7 +220,7 @@ def test_a_gaussian_takes_a_byte_in_files_of_millions(tmp_path, good):
 def _survives(path, data):
     path.write_bytes(data)
     with contextlib.suppress(FormatError):
-        assert read_sog(path).means.shape[1] == 3
+        assert load_sog(path).splats.means.shape[1] == 3
 
 
 CAREFUL = settings(

@@ -85,7 +85,7 @@ def test_scales_beyond_float32_are_clamped_below_and_refused_above(tmp_path):
     (lambda _: b"", "0 bytes"),
     (lambda data: data[:-1], "truncated"),
     (lambda data: data + b"1", "truncated"),
-    (lambda data: b"ply\n" + data[4:], "no .splat"),
+    (lambda data: b"ply\n" + data[4:], "not a .splat"),
     (lambda data: data[:12] + np.float32(-1).tobytes() + data[16:], "negative scales"),
     (lambda data: np.full(len(data) // 4, np.nan, "<f4").tobytes(), "not finite in positions"),
 ])

@@ -10,7 +10,7 @@ from splat_cases import N, edge_splats, few, greatest, plain, rotation_error, un
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.harmonics import basis_rest
-from recon_cli.splats.spz import load_spz, read_spz, write_spz
+from recon_cli.splats.spz import load_spz, write_spz
 
 MIB = 1 << 20
 STEP = 1 / 64  # of harmonics as they are written: every other of the 256 numbers of the format
@@ -21,7 +21,7 @@ STEP = 1 / 64  # of harmonics as they are written: every other of the 256 number
 def test_each_parameter_is_within_half_a_step(tmp_path, version, degree, colored):
     splats = edge_splats(degree, colored)
     write_spz(tmp_path / "a.spz", splats, version=version)
-    back = read_spz(tmp_path / "a.spz")
+    back = load_spz(tmp_path / "a.spz").splats
     assert len(back) == N
     assert back.sh_degree == degree
     assert greatest(back.means, splats.means) <= 0.5 / 4096 + 1e-9
@@ -40,7 +40,7 @@ def test_each_parameter_is_within_half_a_step(tmp_path, version, degree, colored
 def test_versions_hold_the_same_values(tmp_path):
     write_spz(tmp_path / "3.spz", edge_splats(), version=3)
     write_spz(tmp_path / "4.spz", edge_splats(), version=4)
-    three, four = read_spz(tmp_path / "3.spz"), read_spz(tmp_path / "4.spz")
+    three, four = load_spz(tmp_path / "3.spz").splats, load_spz(tmp_path / "4.spz").splats
     for name, value in three.parameters().items():
         assert torch.equal(value, getattr(four, name)), name
 
@@ -48,9 +48,9 @@ def test_versions_hold_the_same_values(tmp_path):
 @pytest.mark.parametrize("version", [3, 4])
 def test_bytes_stay_when_a_file_is_read_and_written_again(tmp_path, version):
     write_spz(tmp_path / "a.spz", edge_splats(), version=version)
-    once = read_spz(tmp_path / "a.spz")
+    once = load_spz(tmp_path / "a.spz").splats
     write_spz(tmp_path / "b.spz", once, version=version)
-    again = read_spz(tmp_path / "b.spz")
+    again = load_spz(tmp_path / "b.spz").splats
     for name, value in once.parameters().items():
         if name != "quats":  # two components of one size may change places
             assert torch.equal(value, getattr(again, name)), name
@@ -84,7 +84,7 @@ def test_version_2_is_version_3_with_bytes_of_rotations(tmp_path):
     splats = edge_splats()
     for version in (2, 3):
         write_spz(tmp_path / f"{version}.spz", splats, version=version)
-    two, three = read_spz(tmp_path / "2.spz"), read_spz(tmp_path / "3.spz")
+    two, three = load_spz(tmp_path / "2.spz").splats, load_spz(tmp_path / "3.spz").splats
     assert plain(tmp_path / "2.spz")[4] == 2
     for name, value in three.parameters().items():
         if name != "quats":
@@ -107,10 +107,10 @@ def test_rotations_of_version_2_are_bytes_of_x_y_z(tmp_path):
     rotations = np.rint(vectors * 127.5 + 127.5).astype(np.uint8).tobytes()
     (tmp_path / "b.spz").write_bytes(
         gzip.compress(b"NGSP" + struct.pack("<I", 2) + data[8:16] + body + rotations))
-    back = read_spz(tmp_path / "b.spz")
+    back = load_spz(tmp_path / "b.spz").splats
     wanted = np.array([[1, 0, 0, 0], [0.5, 0.5, -0.5, 0.5], [0, 0, -1, 0]])
     assert np.allclose(back.quats, wanted, atol=1.5 / 127.5)
-    assert torch.equal(back.means, read_spz(tmp_path / "a.spz").means)
+    assert torch.equal(back.means, load_spz(tmp_path / "a.spz").splats.means)
 
 
 @pytest.mark.parametrize(("far", "bits"), [(1.0, 12), (2047.9, 12), (2048.0, 11), (32767.9, 8)])
@@ -118,7 +118,7 @@ def test_positions_get_the_bits_that_the_extent_leaves(tmp_path, far, bits):
     splats = edge_splats(0, far=far)
     write_spz(tmp_path / "a.spz", splats)
     assert plain(tmp_path / "a.spz")[13] == bits
-    assert greatest(read_spz(tmp_path / "a.spz").means, splats.means) <= 0.5 / 2**bits + 1e-9
+    assert greatest(load_spz(tmp_path / "a.spz").splats.means, splats.means) <= 0.5 / 2**bits + 1e-9
 
 
 def test_what_is_too_large_is_made_smaller_with_a_warning(tmp_path, caplog):
@@ -126,7 +126,7 @@ def test_what_is_too_large_is_made_smaller_with_a_warning(tmp_path, caplog):
     splats.log_scales[2, 1] = 6.1
     write_spz(tmp_path / "a.spz", splats)
     assert "1 Gaussians are made smaller" in caplog.text
-    assert read_spz(tmp_path / "a.spz").log_scales[2, 1] == 5.9375
+    assert load_spz(tmp_path / "a.spz").splats.log_scales[2, 1] == 5.9375
 
 
 def test_what_does_not_fit_is_refused_and_nothing_written(tmp_path):
@@ -148,7 +148,7 @@ def test_what_lies_outside_the_bytes_is_clamped(tmp_path):
     splats = few()
     splats.log_scales[0, 0], splats.sh_dc[0, 0], splats.sh_rest[0, 0, 0] = -13, 7, -4
     write_spz(tmp_path / "a.spz", splats)
-    back = read_spz(tmp_path / "a.spz")
+    back = load_spz(tmp_path / "a.spz").splats
     assert back.log_scales[0, 0] == -10
     assert back.sh_dc[0, 0] == pytest.approx(0.5 / 0.15)
     assert back.sh_rest[0, 0, 0] == -1
@@ -172,9 +172,9 @@ def with_extension(path, kind, payload):
 def test_extensions_that_change_nothing_are_passed_over(tmp_path, version, kind):
     path = tmp_path / "a.spz"
     write_spz(path, few(), version=version, axes=None)
-    wanted = read_spz(path)
+    wanted = load_spz(path).splats
     with_extension(path, kind, b"\4\0\0\0")
-    assert torch.equal(read_spz(path).means, wanted.means)
+    assert torch.equal(load_spz(path).splats.means, wanted.means)
 
 
 # Numbers of the extension and the signs that lead to "rdf", or "rfu" where up is along z; checked
@@ -187,7 +187,7 @@ def test_extensions_that_change_nothing_are_passed_over(tmp_path, version, kind)
 def test_the_axes_that_a_file_names_are_turned_into_ours(tmp_path, number, signs, up, version):
     path = tmp_path / "a.spz"
     write_spz(path, few(), version=version, axes=None)
-    stored = read_spz(path)
+    stored = load_spz(path).splats
     with_extension(path, 0xADBE0003, struct.pack("<I", number))
     scene = load_spz(path)
     assert scene.up == up
@@ -202,14 +202,15 @@ def test_the_axes_that_a_file_names_are_turned_into_ours(tmp_path, number, signs
 def test_a_file_that_names_no_axes_stays_and_those_given_win(tmp_path):
     path = tmp_path / "a.spz"
     write_spz(path, few(), axes=None)
-    stored = read_spz(path)
+    stored = load_spz(path).splats
     assert load_spz(path).up is None
-    assert torch.equal(read_spz(path, axes="rub").means, stored.means * torch.tensor([1, -1, -1]))
+    turned = load_spz(path, axes="rub").splats
+    assert torch.equal(turned.means, stored.means * torch.tensor([1, -1, -1]))
     with_extension(path, 0xADBE0003, struct.pack("<I", 0))  # unspecified
-    assert torch.equal(read_spz(path).means, stored.means)
+    assert torch.equal(load_spz(path).splats.means, stored.means)
     write_spz(path, few(), axes="rub")
-    assert torch.equal(read_spz(path).means, stored.means * torch.tensor([1, -1, -1]))
-    assert torch.equal(read_spz(path, axes="rdf").means, stored.means)
+    assert torch.equal(load_spz(path).splats.means, stored.means * torch.tensor([1, -1, -1]))
+    assert torch.equal(load_spz(path, axes="rdf").splats.means, stored.means)
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -221,18 +222,18 @@ def test_the_file_names_its_axes_and_the_antialiasing_of_its_scene(tmp_path, ver
     assert (load_spz(path).up, load_spz(path).antialiased) == ("-y", False)
     write_spz(path, few(), version=version, axes="rfu", antialiased=True)
     assert (load_spz(path).up, load_spz(path).antialiased) == ("z", True)
-    assert torch.equal(read_spz(path).sh_dc, read_spz(path, axes="rfu").sh_dc)
+    assert torch.equal(load_spz(path).splats.sh_dc, load_spz(path, axes="rfu").splats.sh_dc)
 
 
 def test_harmonics_of_degree_4_are_cut_to_degree_3_with_a_warning(tmp_path, caplog):
     path = tmp_path / "a.spz"
     write_spz(path, few(), axes=None)
-    wanted, data = read_spz(path), plain(path)
+    wanted, data = load_spz(path).splats, plain(path)
     n, start = len(few()), 16 + 20 * len(few())
     harmonics = np.frombuffer(data[start:], np.uint8).reshape(n, 15, 3)
     more = np.concatenate([harmonics, np.full((n, 9, 3), 7, np.uint8)], axis=1)
     path.write_bytes(data[:12] + b"\4" + data[13:start] + more.tobytes())
-    assert torch.equal(read_spz(path).sh_rest, wanted.sh_rest)
+    assert torch.equal(load_spz(path).splats.sh_rest, wanted.sh_rest)
     assert "degree 4 are cut to degree 3" in caplog.text
 
 
@@ -241,4 +242,4 @@ def test_many_equal_gaussians_are_read_back(tmp_path, version):
     """They pack far better than any scene and must not be taken for a bomb."""
     splats = few(1).map(lambda value: value.repeat(150_000, *[1] * (value.dim() - 1)))
     write_spz(tmp_path / "a.spz", splats, version=version)
-    assert len(read_spz(tmp_path / "a.spz")) == 150_000
+    assert len(load_spz(tmp_path / "a.spz").splats) == 150_000

@@ -122,6 +122,6 @@ def test_a_scene_that_no_view_sees_is_not_dropped_whole(given, tmp_path):
     for path in inputs.folders["train"].iterdir():
         (tmp_path / "train" / path.name).write_bytes(path.read_bytes())
     write_ply(tmp_path / "train" / "splats.ply", behind)
-    with pytest.raises(ConfigError, match="would leave nothing"):
+    with pytest.raises(ConfigError, match="would remove all"):
         exported(StageInputs({**inputs.folders, "train": tmp_path / "train"}), tmp_path,
                  drop_floaters=True)

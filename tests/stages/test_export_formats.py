@@ -11,18 +11,18 @@ import pytest
 import torch
 from tiny_stages import CONTEXT
 
-from recon_cli.config.stages import EXPORT_FORMATS as EVERY_FORMAT
-from recon_cli.config.stages import PLAN, ExportConfig
+from recon_cli.config.stages import ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError, StageError
 from recon_cli.io.colmap import read_images
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS
+from recon_cli.splats.format import SplatFormat
 from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
-from recon_cli.splats.registry import FORMATS, SplatFormat, read_splats
+from recon_cli.splats.registry import FORMATS, read_splats
 from recon_cli.stages import export
-from recon_cli.workspace.export_record import MAX_LOSS_DB
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, PLAN
 
-EXPORT_FORMATS = [name for name in EVERY_FORMAT if name != PLAN]  # the tiny scene has no scale
+ASKED = [name for name in EXPORT_FORMATS if name != PLAN]  # the tiny scene has no scale
 
 
 @pytest.fixture
@@ -35,16 +35,12 @@ def inputs(tiny_learnt):
 def exported(tiny_learnt, tmp_path_factory):
     """All formats at once: the folder and the summary."""
     out = tmp_path_factory.mktemp("export")
-    return out, export.run(ExportConfig(format=",".join(EXPORT_FORMATS)), tiny_learnt, out, CONTEXT)
-
-
-def test_every_format_of_gaussians_can_be_asked_for():
-    assert set(FORMATS) <= set(EXPORT_FORMATS)
+    return out, export.run(ExportConfig(format=",".join(ASKED)), tiny_learnt, out, CONTEXT)
 
 
 def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported):
     out, summary = exported
-    assert set(summary.files) == set(EXPORT_FORMATS) - {"ply"}
+    assert set(summary.files) == set(ASKED) - {"ply"}
     ply = out / "splats.ply"
     for name in FORMATS.keys() - {"ply"}:
         told = summary.files[name]
@@ -55,7 +51,7 @@ def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported):
         size = sum(file.stat().st_size for file in files)
         assert told.bytes == size
         assert told.smaller == pytest.approx(ply.stat().st_size / size, abs=1e-3)
-        assert -MAX_LOSS_DB.get(name, 0.3) <= told.psnr_change_db < 0.3, name
+        assert -EXPORT_FORMATS[name].max_loss_db <= told.psnr_change_db < 0.3, name
     assert abs(summary.files["glb"].psnr_change_db) < 1e-3  # it keeps every value
 
 
@@ -82,7 +78,7 @@ def test_the_images_of_the_cameras_lie_beside_them(exported, inputs):
 
 
 def test_an_export_that_was_killed_goes_on_over_what_it_left(inputs, tmp_path):
-    config = ExportConfig(format=",".join(EXPORT_FORMATS))
+    config = ExportConfig(format=",".join(ASKED))
     export.run(config, inputs, tmp_path, CONTEXT)
     before = {path.relative_to(tmp_path): path.read_bytes()
               for path in tmp_path.rglob("*") if path.is_file()}
@@ -118,11 +114,11 @@ def test_a_format_that_loses_more_than_it_may_is_refused(inputs, tmp_path, monke
     real = FORMATS["spz"]
 
     def darker(path):
-        splats = real.read(path)
-        splats.sh_dc -= 1.0
-        return splats
+        scene = real.load(path)
+        scene.splats.sh_dc -= 1.0
+        return scene
 
-    monkeypatch.setitem(FORMATS, "spz", SplatFormat("spz", darker, real.write))
+    monkeypatch.setitem(FORMATS, "spz", SplatFormat(darker, real.write_with))
     summary = export.run(ExportConfig(format="spz,glb"), inputs, tmp_path, CONTEXT)
     assert set(summary.files) == {"glb"}
     assert not (tmp_path / "splats.spz").exists()

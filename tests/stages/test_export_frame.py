@@ -23,7 +23,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
 from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
 from recon_cli.splats.registry import read_splats
-from recon_cli.splats.spz import read_spz, unpack
+from recon_cli.splats.spz import load_spz, unpack
 from recon_cli.stages import export
 from recon_cli.train.train_data import write_config
 from recon_cli.workspace.atomic import write_json
@@ -116,7 +116,7 @@ def test_files_and_cameras_that_are_handed_out_show_the_same_pictures(inputs, op
 
 
 def test_harmonics_that_did_not_turn_would_be_seen(inputs):
-    """The bound above is no bound at all unless this fails it."""
+    """The bound above is only a bound if this fails it."""
     out, _ = exported(inputs, format="colmap", transform=flat(MOVED))
     before = pictures(read_ply(inputs.folders["train"] / "splats.ply"),
                       of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse"))
@@ -189,8 +189,8 @@ def test_a_ply_and_an_spz_say_which_axis_is_up(inputs, name, comment, axes):
     header, _ = unpack(out / "splats.spz", (out / "splats.spz").read_bytes())
     assert header.axes == axes
     # with whatever name, the values are those of the .ply
-    assert torch.allclose(
-        read_spz(out / "splats.spz").means[:20], read_ply(out / "splats.ply").means[:20], atol=1e-3)
+    back = load_spz(out / "splats.spz").splats
+    assert torch.allclose(back.means[:20], read_ply(out / "splats.ply").means[:20], atol=1e-3)
 
 
 def test_a_page_stands_upright_in_any_frame(inputs):

@@ -20,11 +20,12 @@ from recon_cli.scene.splats import transformed
 from recon_cli.splats.axes import turn_from
 from recon_cli.splats.glb import nearest_axes, write_glb
 from recon_cli.splats.ply import describe_scene, read_ply, write_ply
-from recon_cli.splats.registry import FORMATS, load_scene, scene_file
+from recon_cli.splats.registry import FORMATS, load_splats
 from recon_cli.splats.spz import write_spz
 from recon_cli.stages import evaluate, export, import_scene, prune
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_json
+from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.records import ImportRecord
 
 TURN = np.array([[0.0, -1, 0], [0.6, 0, 0.8], [-0.8, 0, 0.6]])
@@ -82,13 +83,13 @@ def test_a_scene_in_the_wrong_frame_is_said_to_be_so_wherever_it_is_scored(
     path = written(tmp_path / "a.ply", transformed(truth(), WORLD.inverse()))
     with caplog.at_level(logging.WARNING, "recon"):
         summary = brought_in(path, inputs, tmp_path / "train", frame="workspace")
-    assert "does not show what the views show" in summary.notices[0]
+    assert "in another frame than the cameras" in summary.notices[0]
     assert summary.notices[0] in caplog.text
     assert summary.training_psnr_db < summary.flat_psnr_db
     (tmp_path / "evaluate").mkdir()
     folders = StageInputs({**inputs.folders, "train": tmp_path / "train"})
     evaluate.run(evaluate.EvaluateConfig(), folders, tmp_path / "evaluate", CONTEXT)
-    assert "does not show what the views show" in (
+    assert "in another frame than the cameras" in (
         tmp_path / "evaluate" / "table.txt").read_text()
 
 
@@ -110,7 +111,7 @@ def test_without_views_nothing_is_moved_and_the_record_says_so(tmp_path):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_comes_in(tmp_path, name):
-    path = scene_file(tmp_path, name)
+    path = tmp_path / EXPORT_FORMATS[name].file
     FORMATS[name].write(path, truth())
     summary = brought_in(path, None, tmp_path / "train")
     assert (summary.format, summary.gaussians) == (name, 60)
@@ -121,7 +122,7 @@ def test_every_format_comes_in(tmp_path, name):
 def test_what_holds_no_scene_is_refused(tmp_path):
     (tmp_path / "a.txt").write_text("text")
     empty = written(tmp_path / "e.ply", truth().select(torch.zeros(60, dtype=torch.bool)))
-    for path, message in ((tmp_path / "a.txt", "no known format"), (empty, "no Gaussians")):
+    for path, message in ((tmp_path / "a.txt", "known format"), (empty, "no Gaussians")):
         with pytest.raises(FormatError, match=message):
             brought_in(path, None, tmp_path / f"out-{path.stem}")
     with pytest.raises(InputError, match="2 files were given"):
@@ -278,7 +279,7 @@ def test_what_was_trained_with_antialiasing_is_recorded_said_and_exported(tmp_pa
     (tmp_path / "export").mkdir()
     export.run(config, StageInputs({"train": tmp_path / "train"}), tmp_path / "export", CONTEXT)
     for name in config.formats:
-        assert load_scene(tmp_path / "export" / f"splats.{name}").antialiased, name
+        assert load_splats(tmp_path / "export" / f"splats.{name}").antialiased, name
 
 
 def test_a_scene_that_was_moved_is_exported_with_the_point_it_was_moved_from(tmp_path):

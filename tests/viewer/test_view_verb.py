@@ -16,8 +16,9 @@ import torch
 
 from recon_cli.cli import main
 from recon_cli.commands import view
-from recon_cli.splats.registry import FORMATS, scene_file
+from recon_cli.splats.registry import FORMATS
 from recon_cli.viewer.content import load_file
+from recon_cli.workspace.export_formats import EXPORT_FORMATS
 
 pytestmark = pytest.mark.floors
 
@@ -44,7 +45,7 @@ def test_it_prints_its_address_and_opens_no_browser_where_there_is_no_terminal(
 @pytest.mark.usefixtures("ended")
 @pytest.mark.parametrize("name", list(FORMATS))
 def test_a_file_of_any_format_is_shown_without_cameras(room, tmp_path, name):
-    path = scene_file(tmp_path, name)
+    path = tmp_path / EXPORT_FORMATS[name].file
     FORMATS[name].write(path, FORMATS["ply"].read(room / "train" / "splats.ply"))
     content = load_file(path)
     assert [len(packed.splats) for packed in content.models.values()] == [60]
@@ -55,7 +56,7 @@ def test_a_file_of_any_format_is_shown_without_cameras(room, tmp_path, name):
 @pytest.mark.parametrize(("words", "code", "said"), [
     (["nothing.ply"], 3, "does not exist"),
     (["empty"], 3, "neither a workspace nor a splat file"),
-    (["text.txt"], 3, "no known format"),
+    (["text.txt"], 3, "known format"),
     (["room", "-w", "room"], 2, "exclude each other"),
     (["room/train/splats.ply", "--model", "base"], 2, "no effect on a file"),
     (["-w", "none"], 4, "view needs ingest"),

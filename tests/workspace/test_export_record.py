@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 
-from recon_cli.config.stages import EXPORT_FORMATS, ExportConfig
+from recon_cli.config.stages import ExportConfig
+from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.export_record import (
     VERSION,
     ExportedFile,

@@ -1,0 +1,166 @@
+"""Writing of the exported scene in the formats of the table, and the check of each file."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+import shutil
+import tempfile
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from recon_cli.config.stages import ExportConfig
+from recon_cli.datasets.transforms import write_transforms
+from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.export.reduce import lower_degrees
+from recon_cli.export.source import ExportSource
+from recon_cli.io.colmap import write_colmap
+from recon_cli.io.meshes import write_point_cloud
+from recon_cli.room.files import write_mesh_file, write_plan
+from recon_cli.room.measures import RoomFrame
+from recon_cli.room.mesh import MeshResult, build_mesh
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+from recon_cli.splats.format import WriteSettings
+from recon_cli.splats.ply import write_points
+from recon_cli.splats.registry import FORMATS
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
+from recon_cli.workspace.export_record import ExportedFile, max_loss_db
+
+_IMAGES = "images"
+_SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
+
+logger = logging.getLogger("recon")
+
+
+def measure_size(splats: Splats, config: ExportConfig, source: ExportSource) -> int:
+    """Returns the bytes that a scene takes in the first format that is asked for.
+
+    ConfigError if the format does not hold Gaussians.
+    """
+    row = EXPORT_FORMATS[config.formats[0]]
+    if row.kind != "gaussians":
+        raise ConfigError(
+            f"--max-mb limits the first format, but {row.name} does not hold Gaussians.",
+            hint="Name ply, spz or another one of Gaussians first in --format.")
+    with tempfile.TemporaryDirectory(prefix="recon-size-") as folder:
+        path = Path(folder) / row.file
+        cut = splats.with_degree(min(row.sh_degree, splats.sh_degree))
+        FORMATS[row.name].write(path, cut, _settings(row, config, source))
+        return _file_size(row, path)
+
+
+def _settings(row: ExportFormat, config: ExportConfig, source: ExportSource) -> WriteSettings:
+    return dataclasses.replace(source.settings, options={
+        name: getattr(config, name) for name in row.options})
+
+
+class FormatWriter:
+    """Writes a scene, whose .ply exists already, in one format after the other."""
+
+    def __init__(
+        self, splats: Splats, out: Path, config: ExportConfig, source: ExportSource,
+        room_frame: RoomFrame | None,
+    ) -> None:
+        self._splats, self._out, self._config = splats, out, config
+        self._source, self._room_frame = source, room_frame
+
+    def write(self, row: ExportFormat) -> ExportedFile:
+        """Writes one format; ReconstructionError if it loses more than it may."""
+        match row.kind:
+            case "gaussians":
+                return self._write_gaussians(row)
+            case "points":
+                inside = self._splats.within(*self._source.room)
+                write_points(self._out / row.file, self._splats.select(inside))
+            case "cameras":
+                _write_cameras(self._out, row, self._source)
+            case "mesh":
+                write_mesh_file(self._out / row.file, self._mesh, self._source.frame.up)
+            case "plan":
+                assert self._room_frame is not None
+                centers = [camera.center for _, camera in self._source.place(
+                    self._source.scene.train)]
+                write_plan(self._out, self._mesh, np.stack(centers), self._room_frame)
+        return ExportedFile(file=row.file)
+
+    def _write_gaussians(self, row: ExportFormat) -> ExportedFile:
+        path = self._out / row.file
+        most = max_loss_db(row.name, dataclasses.asdict(self._config))
+        gain = self._write_until_good(row, path, most)
+        size, ply_size = _file_size(row, path), (self._out / "splats.ply").stat().st_size
+        text = f"{row.name}: {ply_size / size:.1f}x smaller, {gain:+.2f} dB"
+        if not gain >= -most:  # a NaN fails too
+            raise ReconstructionError(
+                f"{text} on {self._source.psnr.describe()}, but it may lose {most:g} dB at most.",
+                hint="Leave this format out, or allow more with --max-loss.")
+        logger.info("%s", text)
+        return ExportedFile(
+            file=row.file, bytes=size, smaller=round(ply_size / size, 3),
+            psnr_change_db=round(gain, 4))
+
+    def _write_until_good(self, row: ExportFormat, path: Path, most: float) -> float:
+        """Writes a file with ever less sharing, and returns its gain in dB over the scene."""
+        form, settings = FORMATS[row.name], _settings(row, self._config, self._source)
+        splats = lower_degrees(self._splats, self._source).at(row.sh_degree)
+        limited = self._config.max_mb is not None and row.name == self._config.formats[0]
+        gain = -math.inf
+        for sharing in row.sharing:
+            form.write(path, splats, dataclasses.replace(settings, sharing=sharing))
+            if limited and _file_size(row, path) > 1e6 * (self._config.max_mb or 0):
+                break
+            gain = self._source.psnr.psnr_db(form.read(path)) - self._psnr_db
+            if gain >= -most:
+                break
+        return gain
+
+    @cached_property
+    def _psnr_db(self) -> float:
+        """PSNR of the scene, which that of all files is compared with."""
+        return self._source.psnr.psnr_db(self._splats)
+
+    @cached_property
+    def _mesh(self) -> MeshResult:
+        """The mesh of all formats that have it, measured if there is a plan."""
+        source, measured = self._source, self._room_frame is not None
+        return build_mesh(
+            self._splats.map(lambda tensor: tensor.to(source.ctx.device)), source.load_training(),
+            source.points if measured else None, source.ctx,
+            max_triangles=self._config.max_triangles, voxel=self._config.voxel)
+
+
+def _file_size(row: ExportFormat, path: Path) -> int:
+    """Returns the bytes of a scene: of its file, or of all beside a lod-meta.json."""
+    if "/" not in row.file:
+        return path.stat().st_size
+    return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+
+
+def _write_cameras(out: Path, row: ExportFormat, source: ExportSource) -> None:
+    """Writes the cameras in one of the formats of this kind, and copies the images."""
+    cameras, scene = _copy_images(out, source), source.scene
+    if row.index:  # a folder: a model of COLMAP
+        shutil.rmtree(out / row.file, ignore_errors=True)  # of a run that was killed
+        write_colmap(out / row.file, cameras, source.points, scene.colors)
+        return
+    points = None
+    if len(scene.points):
+        points = _SPARSE
+        write_point_cloud(out / points, source.points, scene.colors)
+    write_transforms(
+        out / row.file, [(f"{_IMAGES}/{name}", camera) for name, camera in cameras],
+        held_out={f"{_IMAGES}/{view.name}" for view in scene.test}, points=points)
+
+
+def _copy_images(out: Path, source: ExportSource) -> list[tuple[str, Camera]]:
+    """Copies the undistorted images, and returns all cameras, which are useless without."""
+    scene = source.scene
+    every = (*scene.train, *scene.validation, *scene.test)
+    for view in every:
+        target = out / _IMAGES / view.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(view.original, target)
+    return source.place(every)

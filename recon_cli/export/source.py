@@ -1,0 +1,98 @@
+"""The views and points behind an export, in the world of its files, loaded once needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext, StageInputs
+from recon_cli.export.coordinate_frame import ExportFrame
+from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
+from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
+from recon_cli.io.training_scene import load_scene
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.splats import Splats, transformed
+from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.format import WriteSettings
+from recon_cli.train.train_data import load_views, read_config
+from recon_cli.workspace.records import ImportRecord, has_views, read_frame_list
+
+
+class ExportSource:
+    """The inputs of an export besides the Gaussians.
+
+    A scene that was imported without views has synthetic cameras instead of them, which show
+    `splats`, the unreduced scene in the world of the files.
+    """
+
+    def __init__(
+        self, splats: Splats, inputs: StageInputs, frame: ExportFrame, ctx: StageContext, *,
+        antialiased: bool,
+    ) -> None:
+        self.frame, self.ctx, self.has_views = frame, ctx, has_views(inputs.folders)
+        self._splats, self._inputs, self._antialiased = splats, inputs, antialiased
+        self._similarity = frame.similarity  # from the world of the training to that of the files
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Views and points in the world of the training."""
+        if self.has_views:
+            return load_scene(self._inputs.folders, validation=self._run_config.validation)
+        record = ImportRecord.read(self._inputs.folders["train"])
+        assert record is not None, "trained without views"
+        imported = transformed(self._splats, self._similarity.inverse())
+        return synthetic_scene(imported, up=record.up(), max_size=self._run_config.max_size)
+
+    @cached_property
+    def psnr(self) -> ReferencePsnr | SelfPsnr:
+        """The measure of all files: on reference views, or against renders of the scene itself."""
+        if self.has_views:
+            return load_reference_psnr(
+                self.scene, self._similarity, self._run_config.max_size, self.ctx)
+        cameras = [camera for _, camera in self.place(self.scene.train)]
+        psnr = SelfPsnr.from_renders(self._splats, cameras, self.ctx)
+        self.ctx.notice(f"no views: checked on {psnr.describe()}")
+        return psnr
+
+    def load_training(self) -> list[TrainView]:
+        """Returns the training views with their images."""
+        return [dataclasses.replace(view, camera=self._similarity.camera(view.camera))
+                for view in load_views(self.scene.train, self._run_config, self.ctx)]
+
+    def place(self, views: Sequence[View]) -> list[tuple[str, Camera]]:
+        """Returns views by name, with their cameras in the world of the files."""
+        return [(view.name, self._similarity.camera(view.camera))
+                for view in sorted(views, key=lambda view: view.name)]
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """The points [P, 3]."""
+        return self._similarity.points(self.scene.points)
+
+    @property
+    def room(self) -> tuple[list[float], float]:
+        """Middle [3] and radius of the room, outside which lies only the view from its windows."""
+        center = self._similarity.points(self.scene.center)
+        return center.tolist(), self._similarity.scale * self.scene.reach
+
+    @cached_property
+    def settings(self) -> WriteSettings:
+        """Facts that a file can hold, without the options of its format."""
+        record = ImportRecord.read(self._inputs.folders["train"])
+        if record and not self.has_views:
+            title = record.file
+        else:
+            title = read_frame_list(self._inputs.folders["ingest"]).groups[0].name
+        return WriteSettings(
+            up=self.frame.up, antialiased=self._antialiased, title=title,
+            views=self.place(self.scene.train))
+
+    @cached_property
+    def _run_config(self) -> RunConfig:
+        return read_config(self._inputs.folders["train"])
