@@ -30,21 +30,18 @@ from recon_cli.sfm import (
     skeleton,
 )
 from recon_cli.sfm.job import MappingJob, Reporter, Result, StepLog, fresh_folder
+from recon_cli.sfm.limits import ENOUGH_FRAMES, MIN_FRAMES, MIN_ONE_POINT, MIN_PAIR_INLIERS
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.time_estimate import format_minutes
 from recon_cli.sfm.trusted_part import cuts_models, deliver_parts
 from recon_cli.sfm.verdict import ModelVerdict, examine
-from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 OTHERS = "others"  # in the folder of an attempt: its models that hold other frames, by number
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
-FEW = 30
-# Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
-# held all of them; a slow walk that fell into four to seven models 76 to 82%.
-ENOUGH = 0.9
+FEW_PHOTOS = 30
 # How much longer than the longest attempt so far a mapping may take. Relaxed thresholds took 0.8
 # and 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
@@ -107,7 +104,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     if skeleton.is_continuous(job):
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
-    elif count > FEW and not job.split and not job.segments:
+    elif count > FEW_PHOTOS and not job.split and not job.segments:
         ways = (Fallback("coarse", f"the coarsest features of {count} frames show which overlap",
                          skeleton.choose_coarse_pairs, skeleton.complete_coarse), *ways)
     if job.segments:
@@ -176,7 +173,7 @@ def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
     Once all pairs are matched, these are only those that matches connect to it, directly or not.
     """
     counts = database.keypoint_counts(job.database)
-    textured = {name for name, count in counts.items() if count >= checks.MIN_KEYPOINTS}
+    textured = {name for name, count in counts.items() if count >= MIN_PAIR_INLIERS}
     if database.progress(job.database, "matches") < len(counts) * (len(counts) - 1) // 2:
         return textured
     held = set(mapper.list_registered(candidate.model))
@@ -187,7 +184,7 @@ def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
 def shortfall(candidate: ModelCandidate, reach: Collection[str]) -> str:
     """Returns why a model is not good enough, given the frames that it could hold; empty if not."""
     held = candidate.model.num_reg_images()
-    if held < ENOUGH * len(reach):
+    if held < ENOUGH_FRAMES * len(reach):
         return f"only {held} of {len(reach)} frames that can be placed got a camera"
     apart = [names for names in candidate.apart if set(names).intersection(reach)]
     if apart:
@@ -206,7 +203,7 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     """
     def quality(attempt: MapperAttempt) -> tuple[float, float]:
         link = attempt.weak_link if attempt.weak_link is not None else float(attempt.trusted)
-        link = link if attempt.trusted else min(link, MIN_AGREEING)
+        link = link if attempt.trusted else min(link, MIN_ONE_POINT)
         most = max(len(other.registered) for other in attempts)
         return (round(len(attempt.registered) / most * (0.5 + 0.5 * link), 2),
                 -(attempt.reprojection_error_px or 0.0))
@@ -284,7 +281,7 @@ def _publish_best(
         "parts": [parts.describe_part(part.model, part.verdict, held=held, rejected=part.rejected)
                   for part in delivered],
         "poses": None, "models": [len(chosen.registered), *chosen.models[1:]],
-        "apart": [names for names in apart if len(names) >= checks.MIN_FRAMES],
+        "apart": [names for names in apart if len(names) >= MIN_FRAMES],
         "broken": [] if job.accept_weak else list(verdict.problems),
         "left_out": sorted(set(chosen.registered) - held),
         "notes": join_segments.read_refused(job),

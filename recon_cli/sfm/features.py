@@ -25,7 +25,7 @@ STRONG, CONTRAST, USUAL = 0.0133, 0.0067, 1000
 # An image is reduced by powers of two, to this many pixels of the longer side or more, where that
 # leaves this share of the features that are wanted at most: these are the coarsest, and found in a
 # quarter of the time.
-LEAST_SIZE, ENOUGH = 800, 0.5
+LEAST_SIZE, ENOUGH_FEATURES = 800, 0.5
 DESCRIPTOR_SCALE = 512.0  # of COLMAP's descriptors, which are the square roots of Lowe's (RootSIFT)
 
 
@@ -71,7 +71,7 @@ def _find(job: MappingJob, name: str) -> tuple[NDArray[np.float32], NDArray[np.u
         # a reduced pixel counts where all that it covers do
         counts = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) == 255
         points = _strongest(sift.detect(image, np.uint8(255) * counts))
-        if len(points) >= ENOUGH * job.max_features:
+        if len(points) >= ENOUGH_FEATURES * job.max_features:
             break
     points.sort(key=lambda point: -point.size)
     points, rows = sift.compute(image, points[:job.max_features])

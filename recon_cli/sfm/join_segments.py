@@ -24,18 +24,23 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm import database, mapper, matching, merge_models, skeleton
 from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
 from recon_cli.sfm.keyframes import choose_keyframes, name_keyframes
+from recon_cli.sfm.limits import MAX_TENSION
 from recon_cli.sfm.loop_closure import Node, bend_segments, move_frames
 from recon_cli.sfm.pair_checks import check_pairs, list_views
 from recon_cli.sfm.segment_joins import (
-    MAX_TENSION,
     Join,
     Placement,
-    SharedPoints,
     judge_join,
     place_segments,
 )
-from recon_cli.sfm.segment_points import Segment, describe_segment, find_shared_points
 from recon_cli.sfm.segments import overlap
+from recon_cli.sfm.shared_points import (
+    Segment,
+    SharedPoints,
+    choose_owners,
+    describe_segment,
+    find_shared_points,
+)
 from recon_cli.sfm.view_overlap import overlapping_images
 from recon_cli.workspace import atomic
 
@@ -49,10 +54,10 @@ ALIKE = 2
 # Frames of other segments that each is matched with because it should see the same, those that look
 # alike included. Segments are rigid already: on 1,200 frames, 8 besides those end at an error of
 # .106% of the extent in 1,621 CPU seconds, 4 with them at .112% in 1,422.
-OVERLAPPING = 4
+OVERLAPPING_SEGMENTS = 4
 # Adjustments of the whole with new points in between; segments have settled by themselves before.
 # On 300 frames five take a tenth longer for an error of 3.25 cm in place of 3.29.
-ROUNDS = 2
+JOIN_ROUNDS = 2
 
 
 def collect_features(job: MappingJob) -> None:
@@ -148,7 +153,7 @@ def split_by_view_graph(job: MappingJob) -> Result:
     names, count = job.names, job.split
     row = {name: index for index, name in enumerate(names)}
     weights = np.zeros((len(names), len(names)))
-    for (first, second), geometry in skeleton.read_verified(job.database).items():
+    for (first, second), geometry in matching.read_verified(job.database).items():
         weights[row[first], row[second]] = len(geometry.inlier_matches)
     weights += weights.T
     labels = cut_graph(weights, count)
@@ -257,12 +262,7 @@ class JoinedModel:
 def join_models(segments: Sequence[Segment], group: SegmentGroup) -> JoinedModel:
     """Returns the segments of a group, their models copied and moved."""
     members = [segment for segment in segments if segment.index in group.indices]
-    owner: dict[str, Segment] = {}
-    for segment in members:
-        for name, shown in segment.shown.items():
-            best = owner.get(name)
-            if best is None or len(shown.rows) > len(best.shown[name].rows):
-                owner[name] = segment
+    owner = choose_owners(members)
     return JoinedModel(tuple(
         (move_frames(segment.model, {
             name: group.motions[segment.index, name] for name in segment.cameras.names}),
@@ -304,7 +304,7 @@ def _join_by_matches(
     job: MappingJob, segments: Sequence[Segment]
 ) -> tuple[list[Join], list[SegmentGroup], set[Pair]]:
     """Returns joins and groups by all matches so far, and the pairs that show common points."""
-    geometries = skeleton.read_verified(job.database)
+    geometries = matching.read_verified(job.database)
     common = find_shared_points(segments, geometries)
     joins, groups = join_all(
         segments, common, None if job.tracks is None else geometries, seed=job.seed)
@@ -323,7 +323,7 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
              if image.name in chosen]
     return overlapping_images(
         [image for image, _ in owned], [model for _, model in owned], held,
-        most=OVERLAPPING, besides=known)
+        most=OVERLAPPING_SEGMENTS, besides=known)
 
 
 def _images(model: pycolmap.Reconstruction, names: frozenset[str]) -> list[pycolmap.Image]:
@@ -348,7 +348,7 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
     """Returns the cameras of joined segments with the points that all matches give, adjusted."""
     source = dataclasses.replace(job, linked=None)
     if job.linked is not None:
-        geometries = skeleton.read_verified(source.database)
+        geometries = matching.read_verified(source.database)
         checked = check_pairs(source.database, list_views(joined.parts), geometries)
         usable = {pair: geometry for pair, geometry in geometries.items()
                   if pair not in checked.contradicting}
@@ -358,7 +358,7 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
     model = mapper.triangulate(job, _posed(job, joined), rounds=1)
     if model.num_reg_images() < len(job.names):
         model = mapper.extend_model(job, model, rounds=0)
-    mapper.refine(job, model, ROUNDS)
+    mapper.refine(job, model, JOIN_ROUNDS)
     return model
 
 

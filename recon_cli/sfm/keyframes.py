@@ -17,10 +17,10 @@ from recon_cli.sfm.matching import Pair
 
 ALL = 200  # frames up to which all are keyframes
 # Tracks that a keyframe shares with the next one: of its own, and at least. No step is longer.
-SHARED, LEAST, LONGEST = 0.5, 60, 6
+SHARED, LEAST_SHARED, LONGEST = 0.5, 60, 6
 # Tracks from which on two frames are worth matching: of 774 pairs with fewer, five to ten keyframes
 # apart, 58 were verified, of 285 with more, 122.
-FEW = 5
+FEW_TRACKS = 5
 
 
 def choose_keyframes(tracks: Tracks) -> tuple[int, ...]:
@@ -32,7 +32,7 @@ def choose_keyframes(tracks: Tracks) -> tuple[int, ...]:
     rows = [0]
     while rows[-1] < count - 1:
         last = rows[-1]
-        enough = max(LEAST, SHARED * seen[last])
+        enough = max(LEAST_SHARED, SHARED * seen[last])
         step = 1
         while (step < LONGEST and last + step < count - 1
                and len(tracks.matches(last, last + step + 1)[0]) >= enough):
@@ -61,10 +61,10 @@ def track_rows(rows: Sequence[int], steps: Sequence[int]) -> list[tuple[int, int
 
 
 def share_tracks(tracks: Tracks, pairs: Iterable[Pair]) -> set[Pair]:
-    """Returns the pairs of frames that have FEW tracks or more in common."""
+    """Returns the pairs of frames that have FEW_TRACKS tracks or more in common."""
     row = {name: index for index, name in enumerate(tracks.names)}
     return {(first, second) for first, second in pairs
-            if len(tracks.matches(row[first], row[second])[0]) >= FEW}
+            if len(tracks.matches(row[first], row[second])[0]) >= FEW_TRACKS}
 
 
 def side_pairs(tracks: Tracks) -> set[Pair]:

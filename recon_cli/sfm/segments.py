@@ -40,8 +40,8 @@ Names = tuple[str, ...]
 MOST_WHOLE = 200  # frames up to which a capture is mapped as one
 # Frames of a segment, and those that it has in common with the next one. Shorter segments spend
 # more on what they share, longer ones are fewer jobs.
-LENGTH, OVERLAP = 150, 25
-LEAST = 10  # frames of a segment
+LENGTH, SEGMENT_OVERLAP = 150, 25
+LEAST_FRAMES = 10  # frames of a segment
 TRIES = 2  # of a mapping process that is killed, perhaps for want of memory beside others
 COMMAND = "map-segment"  # of recon, which takes JOB
 # in the folder of a segment: what to do, how much of it is done, and what the command printed
@@ -62,11 +62,12 @@ def count_segments(frames: int, asked: str) -> int:
     if asked == "off":
         return 1
     if asked == "auto":
-        return 1 if frames <= MOST_WHOLE else -(-(frames - OVERLAP) // (LENGTH - OVERLAP))
-    most = max(1, frames // LEAST)
+        step = LENGTH - SEGMENT_OVERLAP
+        return 1 if frames <= MOST_WHOLE else -(-(frames - SEGMENT_OVERLAP) // step)
+    most = max(1, frames // LEAST_FRAMES)
     if int(asked) > most:
         raise ConfigError(
-            f"{frames} frames are too few for {asked} segments: each takes {LEAST} or more.",
+            f"{frames} frames are too few for {asked} segments: each takes {LEAST_FRAMES} or more.",
             hint=f"Give at most --segments {most}.")
     return int(asked)
 
@@ -80,8 +81,8 @@ def count_mapped(job: MappingJob) -> int:
 
 
 def overlap(frames: int, count: int) -> int:
-    """Returns how many frames two segments in a row have in common: OVERLAP, or fewer of few."""
-    return min(OVERLAP, frames // (2 * count))
+    """Returns how many frames two segments in a row have in common: fewer of few frames."""
+    return min(SEGMENT_OVERLAP, frames // (2 * count))
 
 
 def split_by_time(names: Sequence[str], count: int) -> tuple[Names, ...]:

@@ -17,7 +17,7 @@ import numpy as np
 
 # Seconds of the piece of work on the machine of `COSTS`, on a core that has nothing else to do.
 PIECE_SECONDS = 0.015
-TRIES = 15
+MEASURES = 15
 BLURS = (1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
 LEAST_TOLD = 60.0  # seconds that are worth a notice
 
@@ -52,14 +52,14 @@ class Costs:
 COSTS = Costs(
     walk=0.12, walk_megapixel=0.48, keyframe=0.34, walk_mapping=0.15,
     photo=0.28, photo_megapixel=0.38, photo_mapping=0.17, split=1.0, join=0.2)
-OVERLAP = 1 / 6  # of a segment's frames, which are mapped in the next one as well
+OVERLAP_SHARE = 1 / 6  # of a segment's frames, which are mapped in the next one as well
 
 
 def list_work(work: Workload) -> dict[str, tuple[float, bool]]:
     """Returns how often each of `Costs` is paid, and whether all cores share it."""
     kind = "walk" if work.tracked else "photo"
     apart = work.segments > 1
-    frames = work.frames * (1 + OVERLAP) if apart else float(work.frames)
+    frames = work.frames * (1 + OVERLAP_SHARE) if apart else float(work.frames)
     mapped = frames * (work.keyframes or work.frames) / work.frames
     items = {kind: (frames, True), f"{kind}_megapixel": (frames * work.megapixels, True),
              f"{kind}_mapping": (mapped, apart)}
@@ -98,7 +98,7 @@ def measure_slowness(threads: int) -> float:
     cv2.setNumThreads(1)
     try:
         with ThreadPoolExecutor(threads) as pool:
-            seconds = list(pool.map(take, range(TRIES * threads)))
+            seconds = list(pool.map(take, range(MEASURES * threads)))
     finally:
         cv2.setNumThreads(before)
     return float(np.mean(seconds)) / PIECE_SECONDS

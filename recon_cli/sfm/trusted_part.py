@@ -15,6 +15,7 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, mapper
 from recon_cli.sfm.job import MappingJob
+from recon_cli.sfm.limits import MIN_FRAMES, MIN_IMAGES_PRINCIPAL
 from recon_cli.sfm.merge_models import ModelCandidate, drop_outliers
 from recon_cli.sfm.verdict import (
     MAX_LEAP,
@@ -28,8 +29,8 @@ from recon_cli.sfm.verdict import (
 Names = tuple[str, ...]
 
 # Frames of a part beside the largest, a tenth of the capture within these bounds: 20 are worth a
-# scene, and fewer than 10 cannot tell the principal point (`mapper.MIN_IMAGES_PRINCIPAL`).
-FEWEST, ENOUGH = 10, 20
+# scene, and fewer than 10 cannot tell the principal point (`limits`).
+FEWEST_FRAMES, WORTH_FRAMES = MIN_IMAGES_PRINCIPAL, 20
 _MOST_NAMED = 5  # parts in an error
 
 
@@ -62,7 +63,7 @@ def cuts_models(job: MappingJob) -> bool:
 
 def least_frames(job: MappingJob) -> int:
     """Returns how many frames a part beside the largest must have."""
-    return min(max(len(job.names) // 10, FEWEST), ENOUGH)
+    return min(max(len(job.names) // 10, FEWEST_FRAMES), WORTH_FRAMES)
 
 
 def find_parts(
@@ -73,7 +74,7 @@ def find_parts(
     The points of a model that has none are triangulated.
     """
     least = least_frames(job)
-    parts = list(_cut(job, whole, checks.MIN_FRAMES))
+    parts = list(_cut(job, whole, MIN_FRAMES))
     for other in sorted(others, key=mapper.model_size, reverse=True):
         held = {name for part in parts for name in mapper.list_registered(part.model)}
         names = set(mapper.list_registered(other)) - held

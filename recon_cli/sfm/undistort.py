@@ -20,10 +20,10 @@ from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.room.scale import ScaleBetween
-from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.align_world import world_transform
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
+from recon_cli.sfm.shared_points import to_sim3d
 from recon_cli.workspace import atomic
 from recon_cli.workspace.records import read_poses
 from recon_cli.workspace.summaries import WorldSummary
@@ -49,7 +49,7 @@ def place_model(job: MappingJob) -> Result:
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
         metric=job.known_poses and job.poses is not None and read_poses(job.poses).metric,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()})
-    move_model(model, world.similarity)
+    model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")
     write_model(model, folder)
     publish(folder, job.out / "sparse")
@@ -58,12 +58,6 @@ def place_model(job: MappingJob) -> Result:
     if (part / VERDICT).exists():
         atomic.write_json(job.out / VERDICT, atomic.read_json(part / VERDICT))
     return summary
-
-
-def move_model(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
-    """Moves cameras and points of `model`; each observation keeps its reprojection error."""
-    model.transform(pycolmap.Sim3d(
-        similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:

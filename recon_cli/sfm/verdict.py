@@ -23,18 +23,12 @@ from recon_cli.errors import SfmError, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
+from recon_cli.sfm.limits import FEW_KEYPOINTS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
 from recon_cli.sfm.open_loops import OpenLoop, find_open_loops
-from recon_cli.sfm.scale_drift import MAX_ERROR, ScaleCut, find_weakest_scale, is_scale_known
+from recon_cli.sfm.scale_drift import MAX_SCALE_ERROR, ScaleCut, find_weakest_scale, is_scale_known
 from recon_cli.sfm.still_points import MAX_STILL, find_still_share
 from recon_cli.sfm.visual_aliasing import VisualAliasing
-from recon_cli.sfm.weakest_cut import (
-    MIN_AGREEING,
-    MIN_EXPLAINED,
-    MIN_MATCHES,
-    OutlierCamera,
-    WeakestCut,
-    find_weakest_cut,
-)
+from recon_cli.sfm.weakest_cut import OutlierCamera, WeakestCut, find_weakest_cut
 
 # A jump is a step of this multiple of the usual one, the median of those around it. Longest steps
 # measured: 1.1 to 2.8 in good models, 9 to 20 where cameras are displaced.
@@ -43,9 +37,6 @@ WINDOW = 15  # steps; a median over fewer follows the jump itself
 MIN_STEPS = 5  # fewer say nothing about what is usual
 # Longer steps cannot be a cut in a video: displaced cameras gave 9 to 20, a walk's end at rest 6.
 MAX_LEAP = 100.0
-# COLMAP gives an image a camera from 30 inliers on, and in six of eight captures 19 of 20 images
-# had a fifth of their keypoints or more in the model. The fewest of any image with a camera: 450.
-MIN_KEYPOINTS = 150
 # Share of the median sharpness below which an image is called blurred, as in IngestConfig.
 BLURRED = 0.5
 MOST_LINES = 5  # for images without a camera; all of them are in the verdict
@@ -104,7 +95,7 @@ class ModelVerdict:
     jumps: tuple[Jump, ...]  # far too long steps of the camera; empty unless a video
     keypoints: Histogram  # of each image
     points: Histogram  # of the model that each camera sees
-    neighbours: Histogram  # of each camera, those with which it shares MIN_MATCHES points
+    neighbours: Histogram  # of each camera, those with which it shares MIN_POSE_INLIERS points
     still: float  # share of the points in three or more images that do not move in them
     # Of a walk: where the relative scale of both sides is known least, between the stretches of an
     # open loop where there is one; None where nothing tells.
@@ -184,7 +175,8 @@ def examine(
         unregistered=explain_unregistered(evidence, sharpness or {}), jumps=jumps,
         keypoints=Histogram.of(evidence.keypoints),
         points=Histogram.of(evidence.points[rows]),
-        neighbours=Histogram.of(np.count_nonzero(evidence.shared[rows] >= MIN_MATCHES, axis=1)),
+        neighbours=Histogram.of(
+            np.count_nonzero(evidence.shared[rows] >= MIN_POSE_INLIERS, axis=1)),
         still=still, scale=scale, open_loops=loops,
         problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
                   *_describe_drift(loops, scale), *_describe_still(still),
@@ -214,7 +206,7 @@ def is_broken(cut: WeakestCut) -> bool:
 
 
 def _is_torn(cut: WeakestCut) -> bool:
-    return cut.share is not None and cut.share < MIN_AGREEING
+    return cut.share is not None and cut.share < MIN_ONE_POINT
 
 
 def is_aliased(aliasing: VisualAliasing) -> bool:
@@ -275,8 +267,8 @@ def _describe_drift(loops: Sequence[OpenLoop], cut: ScaleCut | None) -> list[str
         return []
     return [
         f"How large the {len(cut.sides[0])} cameras on one side of the cut{where} are against the "
-        f"{len(cut.sides[1])} others is known to {cut.error:.0%} only, but {MAX_ERROR:.0%} is "
-        "needed: too little that both see shows depth."]
+        f"{len(cut.sides[1])} others is known to {cut.error:.0%} only, but {MAX_SCALE_ERROR:.0%} "
+        "is needed: too little that both see shows depth."]
 
 
 def _describe_still(share: float) -> list[str]:
@@ -293,7 +285,8 @@ def _describe_break(cut: WeakestCut) -> list[str]:
     if _is_torn(cut):
         return [
             f"The model is broken: of what the closest images of {_sides(cut.sides)} have in "
-            f"common, only {cut.share:.0%} is one point in both, but {MIN_AGREEING:.0%} is needed."]
+            f"common, only {cut.share:.0%} is one point in both, but {MIN_ONE_POINT:.0%} is "
+            "needed."]
     return [
         f"The model is broken: of the matches between the closest images of {_sides(cut.sides)}, "
         f"only {cut.explained:.0%} agree with the cameras, but {MIN_EXPLAINED:.0%} must."]
@@ -381,7 +374,7 @@ def _reason(
     # A blurred image matches little. One that matches others well may show another room.
     if blur and matches[~placed].sum() <= matches[placed].sum():
         return f"blurred: {blur}"
-    if evidence.keypoints[index] < MIN_KEYPOINTS:
+    if evidence.keypoints[index] < FEW_KEYPOINTS:
         return f"too few features: {evidence.keypoints[index]} keypoints"
     if not placed.any():
         where = f", only with {len(others)} that have none" if len(others) else ""

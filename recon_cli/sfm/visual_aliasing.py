@@ -29,11 +29,11 @@ MAX_ANGLE_DEG = 10.0
 MAX_RATIO = 1.3
 # Cells along each side of an image, and points that a cell must expect to count. Of those 55 to 65%
 # are found in good models: all six are missed by chance one time in two hundred.
-GRID, MIN_POINTS = 6, 6
+GRID, MIN_CELL_POINTS = 6, 6
 # Points sampled per image, evenly; 1000 are 28 a cell.
 MAX_POINTS = 1000
 # A pair counts where each expects this share of its cells in the other: one may see through walls.
-MIN_SHARE = 0.25
+MIN_CELL_SHARE = 0.25
 MIN_CELLS = 100  # between two groups of images: a handful of pairs
 # Of what pairs within two groups of images find of their cells, the pairs between them must find so
 # much. See `tests/bench/bench_verdict.py`.
@@ -102,7 +102,7 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
             expected[band, :, other] = (should & (bands == band)).sum(axis=1)
             confirmed[band, :, other] = (does & (bands == band)).sum(axis=1)
     share = expected.sum(axis=0) / np.maximum(cells.sum(axis=1), 1)[:, None]
-    mutual = (np.minimum(share, share.T) >= MIN_SHARE) & evidence.tried
+    mutual = (np.minimum(share, share.T) >= MIN_CELL_SHARE) & evidence.tried
     return Overlap(
         np.where(mutual, expected + expected.transpose(0, 2, 1), 0.0),
         np.where(mutual, confirmed + confirmed.transpose(0, 2, 1), 0.0))
@@ -222,7 +222,7 @@ def _bands(
 
 
 def _cells(
-    samples: _Samples, chosen: NDArray[np.int64], count: int, least: int = MIN_POINTS
+    samples: _Samples, chosen: NDArray[np.int64], count: int, least: int = MIN_CELL_POINTS
 ) -> NDArray[np.bool_]:  # [N, GRID * GRID]
     """Returns the cells of `count` images that hold at least so many of the chosen samples."""
     held = np.bincount(samples.cell[chosen], minlength=count * GRID * GRID)

@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.segment_joins import (
-    SegmentCameras,
-    SharedPoints,
     camera_residuals,
     judge_join,
     place_segments,
 )
+from recon_cli.sfm.shared_points import SegmentCameras, SharedPoints
 
 DEPTH = 3.0
 EXACT = 1e-6

@@ -41,7 +41,7 @@ def test_segments_of_a_video_cover_every_frame_and_overlap_as_asked(frames, coun
     assert len(parts) == count
     assert set().union(*parts) == set(names)
     common = segments.overlap(frames, count)
-    assert 0 < common <= segments.OVERLAP
+    assert 0 < common <= segments.SEGMENT_OVERLAP
     for before, after in itertools.pairwise(parts):
         assert before[-common:] == after[:common]
     for first, third in zip(parts, parts[2:], strict=False):

@@ -12,6 +12,7 @@ from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, matching, skeleton
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.matching import read_verified
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 from recon_cli.sfm.skeleton import (
     build_skeleton,
@@ -22,7 +23,6 @@ from recon_cli.sfm.skeleton import (
     is_continuous,
     link,
     near_pairs,
-    read_verified,
 )
 from recon_cli.sfm.view_overlap import WIDEST, overlapping_images, overlapping_pairs
 
