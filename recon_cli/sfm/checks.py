@@ -24,7 +24,7 @@ def check_texture(keypoints: Mapping[str, int]) -> None:
         return
     raise SfmError(
         f"No features: {usable} of {len(keypoints)} frames show any texture, but at least "
-        f"{MIN_FRAMES} are needed.",
+        f"{MIN_FRAMES} must.",
         hint="Record again with more light and with furniture in view: bare walls and darkness "
         "cannot be matched.")
 

@@ -155,7 +155,7 @@ def explained_matches(
     points = at_infinity + np.clip(inverse, 0, most)[:, None] * motion.translation
     places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
     errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
-    return np.asarray(errors <= offset)  # NaN, behind the camera, is no agreement
+    return np.asarray(errors <= offset)  # NaN, behind the camera, does not agree
 
 
 def lift_rays(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.images import read_png
 from recon_cli.sfm import checks, database
-from recon_cli.sfm.job import MappingJob, Reporter, Result
+from recon_cli.sfm.job import MappingJob, Reporter
+from recon_cli.sfm.results import FeaturesResult
 
 # COLMAP's values but for the contrast, a difference of Gaussians times the number of layers: at its
 # value of .02 OpenCV finds a tenth fewer, at STRONG as many. In dim frames the strongest USUAL are
@@ -29,7 +30,7 @@ LEAST_SIZE, ENOUGH_FEATURES = 800, 0.5
 DESCRIPTOR_SCALE = 512.0  # of COLMAP's descriptors, which are the square roots of Lowe's (RootSIFT)
 
 
-def extract_features(job: MappingJob, report: Reporter) -> Result:
+def extract_features(job: MappingJob, report: Reporter) -> FeaturesResult:
     """Fills the database with the features of all frames and returns how many there are.
 
     Images that an interrupted run has finished are kept. FormatError if a frame cannot be read,
@@ -52,7 +53,7 @@ def extract_features(job: MappingJob, report: Reporter) -> Result:
             report.done(done)
     counts = database.keypoint_counts(job.database)
     checks.check_texture(counts)
-    return {"rows": len(counts), "keypoints": sum(counts.values())}
+    return FeaturesResult(rows=len(counts), keypoints=sum(counts.values()))
 
 
 def _find(job: MappingJob, name: str) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -1,6 +1,6 @@
 """The frames of a long video that its tracks show to be needed.
 
-Neighbours that show nearly the same say nothing new of the scene. A skeleton is built from frames
+Neighbours that show nearly the same add nothing. A skeleton is built from frames
 that keep a good part of the tracks of the one before, and matches are sought between these; all
 others are placed by what they share with the two beside them.
 """
@@ -68,6 +68,6 @@ def share_tracks(tracks: Tracks, pairs: Iterable[Pair]) -> set[Pair]:
 
 
 def side_pairs(tracks: Tracks) -> set[Pair]:
-    """Returns each frame that is no keyframe with the two keyframes beside it, by names."""
+    """Returns each frame that is not a keyframe with the two keyframes beside it, by names."""
     return {(tracks.names[first], tracks.names[second])
             for first, second in side_rows(choose_keyframes(tracks))}

@@ -21,11 +21,13 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database, features, mapper, matching, parts
 from recon_cli.sfm.evidence import gather_evidence
-from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
 from recon_cli.sfm.merge_models import build_posed_model
+from recon_cli.sfm.results import MatchesResult, ModelResult
 from recon_cli.sfm.verdict import check_weak_link, examine
 from recon_cli.workspace.records import KnownPoses, read_poses
+from recon_cli.workspace.summaries import PosesSummary
 
 # Axes further apart share little: the wider side of a phone's picture spans 65 to 80 degrees.
 MAX_AXES_DEG = 75.0
@@ -37,7 +39,7 @@ FEATURES = 1000  # keypoints an image
 Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
 
 
-def match_known(job: MappingJob, report: Reporter) -> Result:
+def match_known(job: MappingJob, report: Reporter) -> MatchesResult:
     """Matches neighbours in the order of names, and cameras that stand and look alike."""
     poses = _read_poses(job).viewmats
     matching.match_pairs(job, near_pairs(poses) | matching.sequential_pairs(list(poses)), report)
@@ -69,7 +71,7 @@ def neighbours(
     return nearest
 
 
-def build_known_model(job: MappingJob, report: Reporter) -> Result:
+def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     """Writes the model of the given cameras into out/model and returns what it holds.
 
     SfmError if too few frames have a pose, or the poses do not fit the images.
@@ -102,10 +104,10 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         notes = []
     parts.write_parts(job, [(model, verdict)])
     shutil.rmtree(job.attempts, ignore_errors=True)
-    return {
-        "parts": [parts.describe_part(model, verdict)], "notes": notes,
-        "models": [model.num_reg_images()], "apart": [], "rungs": [],
-        "poses": {"use": job.pose_use, "metric": known.metric, **movement}}
+    return ModelResult(
+        parts=(parts.describe_part(model, verdict),), notes=tuple(notes),
+        models=(model.num_reg_images(),),
+        poses=PosesSummary(use=job.pose_use, metric=known.metric, **movement))
 
 
 def _read_poses(job: MappingJob) -> KnownPoses:
@@ -226,7 +228,7 @@ class SpotCheck:
     def describe(self) -> str:
         """Returns a sentence for the terminal."""
         if self.share is None:
-            return f"The given poses could not be checked: {self.matches} matches are too few."
+            return f"The given poses could not be checked: too few matches ({self.matches})."
         return (f"{self.share:.0%} of {self.matches} matches between sampled images agree with the "
                 "given poses.")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import database
-from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import (
     LOSS_SCALE,
     MAX_ERROR_PX,
@@ -224,18 +224,6 @@ def triangulate(
         refine_intrinsics)
     shutil.rmtree(job.attempts / MODELS)
     return triangulated
-
-
-def describe_model(model: pycolmap.Reconstruction) -> Result:
-    """Returns the contents of a model for the stage's summary; None for figures without tracks."""
-    tracks = model.compute_num_observations() > 0
-    return {
-        "registered": list_registered(model),
-        "points": model.num_points3D(),
-        "mean_track_length": model.compute_mean_track_length() if tracks else None,
-        "reprojection_error_px": model.compute_mean_reprojection_error() if tracks else None,
-        "median_triangulation_angle_deg":
-            float(np.median(triangulation_angles(model))) if tracks else None}
 
 
 def list_registered(model: pycolmap.Reconstruction) -> list[str]:

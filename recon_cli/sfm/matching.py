@@ -17,8 +17,9 @@ from recon_cli.errors import FormatError, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.database import scales
-from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, Result
+from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
 from recon_cli.sfm.limits import MAX_TRIALS, MIN_DEEP_SHARE, MIN_PAIR_INLIERS
+from recon_cli.sfm.results import MatchesResult
 
 CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
 # COLMAP's default. With the powers of two an image also meets those 16, 32, ... 512 further on.
@@ -235,13 +236,13 @@ def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
     return verified
 
 
-def count_matches(job: MappingJob) -> Result:
+def count_matches(job: MappingJob) -> MatchesResult:
     """Returns the numbers of matched pairs, verified pairs and verified matches."""
     groups = database.count_inliers(job.database)
-    return {
-        "rows": database.progress(job.database, "matches"),
-        "verified_pairs": sum(pairs for pairs, _, _ in groups),
-        "matches": sum(matches for _, matches, _ in groups)}
+    return MatchesResult(
+        rows=database.progress(job.database, "matches"),
+        verified_pairs=sum(pairs for pairs, _, _ in groups),
+        matches=sum(matches for _, matches, _ in groups))
 
 
 def check_motion(job: MappingJob) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm import mapper, matching, verdict
@@ -123,11 +125,17 @@ def find_similarity(
     """Returns the similarity between two models of one database; None where too few points agree.
     """
     both = [describe_segment(index, model) for index, model in enumerate((source, target))]
-    shared = find_shared_points(both, matching.read_verified(job.database))
-    agreed = [estimate_similarity(
-        points.ours, points.theirs, max_error=MAX_POINT_ERROR * both[1].cameras.depth,
-        min_share=MIN_POSE_SHARE, seed=job.seed) for points in shared]
-    return None if not agreed or agreed[0] is None else agreed[0].motion
+    found = find_shared_points(both, matching.read_verified(job.database))
+    if not found:
+        return None
+    # Each two points once, however many images show them.
+    points = np.unique(np.column_stack([found[0].ours, found[0].theirs]), axis=0)
+    places = np.array([point.xyz for point in target.points3D.values()])
+    depths = np.linalg.norm(places - np.median(both[1].cameras.centers, axis=0), axis=1)
+    agreed = estimate_similarity(
+        points[:, :3], points[:, 3:], max_error=MAX_POINT_ERROR * float(np.median(depths)),
+        min_share=MIN_POSE_SHARE, seed=job.seed)
+    return None if agreed is None else agreed.motion
 
 
 def build_posed_model(

@@ -1,7 +1,7 @@
 """Loops of a walk that a model leaves open: two stretches show one place, and the model has two.
 
 Where a walk comes back, frames far apart in time match. If the cameras have drifted, these matches
-contradict the model, and the mapper drops them: it stays wrong though it was told. Such matches
+contradict the model, and the mapper drops them, so that it stays wrong. Such matches
 agree with each other on one motion, which brings the two copies of the place together. Places that
 only look alike give such a motion as well, but it is larger than what a way drifts.
 """
@@ -23,13 +23,14 @@ from recon_cli.sfm.limits import (
     NEAR_IN_WALK,
 )
 from recon_cli.sfm.shared_points import estimate_similarity
+from recon_cli.workspace.json_record import JsonRecord
 
 # Share of the points that are in one place already above which the loop is closed.
 CLOSED = 0.2
 
 
 @dataclass(frozen=True)
-class OpenLoop:
+class OpenLoop(JsonRecord):
     """Two stretches of a walk that show the same place, which the model has twice."""
 
     first: str  # an image of the earlier stretch

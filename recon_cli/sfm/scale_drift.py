@@ -1,4 +1,4 @@
-"""How well the scale of one stretch of a walk is known against that of the next.
+"""How well the scale of one stretch of a walk is known relative to the next.
 
 A camera that turns in a narrow place ties what lies before it to what comes after by points that
 show little of either scale. Matches agree then, whatever the scale is: a walk of 30 m was trusted
@@ -21,6 +21,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.floor_heights import SPREAD, compare_heights, measure_heights
 from recon_cli.sfm.limits import LOSS_SCALE
+from recon_cli.workspace.json_record import JsonRecord
 
 # The scale of a stretch is that of its cameras' centres. It spans this share of the extent of all
 # and of the usual depth, and so many cameras: on a shorter one the camera stands still, or turns.
@@ -31,13 +32,13 @@ LEAST_EXTENT, LEAST_DEPTHS, LEAST_CAMERAS = 0.2, 0.5, 10
 SHARED_ERRORS = 10.0
 MAX_SCALE_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_scale_breaks.py`
 DOUBTFUL = MAX_SCALE_ERROR / 3  # the floor is looked at from here on
-_RIDGE = 1e-10  # times the diagonal: position, turn and scale of the whole are free
+_RIDGE = 1e-10  # times the diagonal: position, turn and scale of the model are free
 _POSE = 6  # unknowns of a camera: its turn, and its centre
 
 
 @dataclass(frozen=True)
-class ScaleCut:
-    """Where the relative scale of what lies before and after is known least."""
+class ScaleCut(JsonRecord):
+    """Where the relative scale of the two parts of a walk is known least."""
 
     error: float  # of the relative scale, as a share; one standard deviation
     before: str  # the last image before the cut

@@ -1,4 +1,4 @@
-"""Whether and how two segments belong together, and where all of them lie then.
+"""Which segments belong together, and how all of them lie to each other.
 
 A join is a similarity from points that both segments have: those of the frames in common, and those
 that verified pairs of their other frames match. It is made where two witnesses support it and none
@@ -41,7 +41,7 @@ SAMPLED = 60  # points of a join in the common adjustment
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """What two segments say of each other."""
+    """How two segments lie to each other, and the evidence for and against it."""
 
     first: int
     second: int
@@ -66,7 +66,7 @@ class Join:
 def judge_join(
     shared: SharedPoints, first: SegmentCameras, second: SegmentCameras, *, seed: int
 ) -> Join:
-    """Returns what the points and cameras of two segments say of a join."""
+    """Returns the join of two segments that their points and cameras support or contradict."""
     common = shared.common
     has_frames = bool(set(first.names) & set(second.names))
     motion = _similarity(shared, common, second.depth, seed)
@@ -192,7 +192,7 @@ def place_segments(
         inner = [join for join in order if join.first in members]
         near = [join for join in inner if join in tree or _is_near(join, start, cameras)]
         motions, kept = (start, near) if bending else _close_loops(start, near, tree, cameras)
-        refused = [*(f"the loop between segments {join.first} and {join.second} contradicts the way"
+        refused = [*(f"the loop of segments {join.first} and {join.second} contradicts the walk"
                      for join in inner if join not in kept), *(
             f"segments {join.first} and {join.second} are not joined: " + "; ".join(
                 join.contradictions or ("fewer than two witnesses support it",))

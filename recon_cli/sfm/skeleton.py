@@ -1,4 +1,4 @@
-"""Cameras from little, which show what is worth matching; then from all matches that agree.
+"""First rough cameras, which show the pairs worth matching; then cameras from all that agrees.
 
 Two frames of a video that follow each other cannot be mistaken for others, so the cameras are found
 from tracks through every frame alone. With these cameras, the skeleton, each pair of frames that
@@ -43,7 +43,7 @@ from recon_cli.sfm.matching import Pair, similar_pairs
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 from recon_cli.sfm.view_overlap import WIDEST, overlapping_pairs
 
-LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
+MATCHES_DB = "linked.db"  # matches that may be used, in the folder of an attempt
 # Models in the folder of the attempts: from tracks, and from the coarsest features.
 SKELETON, COARSE_SKELETON = "skeleton", "skeleton.coarse"
 # Distances, in frames of a video, at which tracks are matches: enough for a path around a lost
@@ -72,8 +72,8 @@ def is_continuous(job: MappingJob) -> bool:
         return False
     tracks = _read_tracks(job)
     shared = [len(tracks.matches(index, index + 1)[0]) for index in range(len(tracks.names) - 1)]
-    linked = sum(count >= MIN_PAIR_INLIERS for count in shared)
-    return len(tracks.names) == len(job.names) and linked > CONTINUOUS * len(shared)
+    following = sum(count >= MIN_PAIR_INLIERS for count in shared)
+    return len(tracks.names) == len(job.names) and following > CONTINUOUS * len(shared)
 
 
 def list_keyframes(job: MappingJob) -> tuple[str, ...]:
@@ -126,7 +126,7 @@ def load_skeleton(
             return build_skeleton(job, images)
         # Pairs that were matched would count against the model, but not where it is built first.
         copy = fresh_folder(job.attempts / f"{SKELETON}.partial") / "images.db"
-        shutil.copyfile(replace(job, linked=None).database, copy)
+        shutil.copyfile(replace(job, matches_db=None).database, copy)
         database.clear_matches(copy)
         return build_skeleton(job, copy)
 
@@ -186,7 +186,7 @@ def choose_coarse_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
 def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the models that the coarsest features alone give, the largest first."""
     folder = fresh_folder(job.attempts / f"{COARSE_SKELETON}.mapping")
-    coarse = replace(job, linked=folder / LINKED)
+    coarse = replace(job, matches_db=folder / MATCHES_DB)
     copy_coarsest(job.database, coarse.database)
     pairs = matching.exhaustive_pairs(job.names)
     if len(job.names) > matching.EXHAUSTIVE_MAX:
@@ -220,21 +220,21 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
     """Returns the models that tracks alone give, the largest first; a database has the images."""
     silent = Reporter(io.BytesIO())
     folder = fresh_folder(job.attempts / f"{SKELETON}.mapping")
-    linked = replace(job, linked=folder / LINKED)
+    own = replace(job, matches_db=folder / MATCHES_DB)
     tracks = _read_tracks(job)
     keyframes = choose_keyframes(tracks)
     tracks = tracks.select({row: tracks.names[row] for row in keyframes})
     rows = range(len(keyframes))
-    link(linked, images, {}, tracks, rows)
-    models = mapper.map_incrementally(linked, silent)
+    write_usable_matches(own, images, {}, tracks, rows)
+    models = mapper.map_incrementally(own, silent)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
     # without parallax. What tracks of a long video leave apart is left to the matches.
     whole = len(keyframes) == len(job.names)
     for find_models in (mapper.map_relaxed, mapper.map_globally) if whole else ():
         if _most(models) >= ENOUGH_FRAMES * len(keyframes):
             break
-        link(linked, images, {}, tracks, rows, steps=ALL_TRACK_STEPS)
-        models = max(models, find_models(linked, silent), key=_most)
+        write_usable_matches(own, images, {}, tracks, rows, steps=ALL_TRACK_STEPS)
+        models = max(models, find_models(own, silent), key=_most)
     shutil.rmtree(folder)
     models.sort(key=mapper.model_size, reverse=True)
     return models
@@ -243,10 +243,10 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
 def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the models that the tracks and the matches that agree with them give.
 
-    `job.linked` names the database that is written and mapped from.
+    `job.matches_db` names the database that is written and mapped from.
     """
     models = load_skeleton(job, report)
-    source = replace(job, linked=None).database
+    source = replace(job, matches_db=None).database
     tracks = _read_tracks(job)
     geometries = matching.read_verified(source)
     checked = check_pairs(source, list_models(models), geometries)
@@ -254,9 +254,9 @@ def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconst
               if pair not in checked.contradicting}
     keyframes = choose_keyframes(tracks)
     if _most(models) >= ENOUGH_FRAMES * len(keyframes):
-        link(job, source, usable, tracks, keyframes)
+        write_usable_matches(job, source, usable, tracks, keyframes)
         return [_place_rest(job, close_loops(job, report, _fit(job, models[0])))]
-    link(job, source, usable, tracks, keyframes, steps=ALL_TRACK_STEPS)
+    write_usable_matches(job, source, usable, tracks, keyframes, steps=ALL_TRACK_STEPS)
     if len(keyframes) == len(job.names):
         return mapper.map_relaxed(job, report)
     found = mapper.map_relaxed(job, report, [tracks.names[row] for row in keyframes])
@@ -272,7 +272,7 @@ def close_loops(
 ) -> pycolmap.Reconstruction:
     """Returns a fitted model, bent where loops are open and fitted again to what then agrees."""
     for _ in range(BENDS):
-        geometries = matching.read_verified(replace(job, linked=None).database)
+        geometries = matching.read_verified(replace(job, matches_db=None).database)
         bent = bend_model(fitted, geometries, seed=job.seed)
         if bent is None:
             break
@@ -286,9 +286,9 @@ def _fit_where_it_meets(
 ) -> pycolmap.Reconstruction:
     """Returns a model fitted to the matches of frames that overlap by it, but not by those before.
 
-    `job.linked` is written anew with all that does not contradict the model.
+    `job.matches_db` is written anew with all that does not contradict the model.
     """
-    source, tracks = replace(job, linked=None), _read_tracks(job)
+    source, tracks = replace(job, matches_db=None), _read_tracks(job)
     met = overlapping_pairs(model).difference(
         *(overlapping_pairs(other, WIDEST) for other in before))
     if met - database.pair_names(source.database):
@@ -297,7 +297,7 @@ def _fit_where_it_meets(
         report.phase("mapping", len(job.names))
     geometries = matching.read_verified(source.database)
     checked = check_pairs(source.database, list_models([model]), geometries)
-    link(job, source.database, {
+    write_usable_matches(job, source.database, {
         pair: geometry for pair, geometry in geometries.items()
         if pair not in checked.contradicting}, tracks, choose_keyframes(tracks))
     return _fit(job, model)
@@ -337,11 +337,11 @@ def _place_rest(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Rec
     return model if complete else mapper.extend_model(job, model)
 
 
-def link(
+def write_usable_matches(
     job: MappingJob, source: Path, geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
     tracks: Tracks, keyframes: Sequence[int], *, steps: Sequence[int] = TRACK_STEPS,
 ) -> None:
-    """Writes the database `job.linked`: images and keypoints of another one, and these matches.
+    """Writes the database `job.matches_db`: images and keypoints of another one, and these matches.
 
     Observations of tracks follow the keypoints of an image. Where features gave few matches, they
     tie keyframes, by row, that are so many `steps` of them apart, and others to those beside them.

@@ -1,8 +1,8 @@
-"""How long finding the cameras takes, told before it starts.
+"""How long finding the cameras takes, said before it starts.
 
 It follows from the frames, their size and the way they go, and from how fast this machine is right
 now: a piece of work of the same kind, for a fraction of a second on all threads. That a model falls
-short, so that another mapper is tried, cannot be known before; it is told when it happens.
+short, so that another mapper is tried, cannot be known before; it is said when it happens.
 `tests/bench/bench_sfm_estimate.py` compares with what finished workspaces took, and fits `COSTS`.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 PIECE_SECONDS = 0.015
 MEASURES = 15
 BLURS = (1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
-LEAST_TOLD = 60.0  # seconds that are worth a notice
+LEAST_NOTICE = 60.0  # seconds that are worth a notice
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,9 @@ def format_minutes(seconds: float) -> str:
     return f"{text} minute{'s' if text != '1' else ''}"
 
 
-def tell_seconds(work: Workload, threads: int) -> float | None:
-    """Returns the seconds that are told in advance; None where they are too few to be told."""
+def estimate_for_notice(work: Workload, threads: int) -> float | None:
+    """Returns the seconds that a notice says in advance; None where they are too few for one."""
     seconds = expected_seconds(work, threads)
-    if seconds > LEAST_TOLD / 2:  # else the measure is not worth its time
+    if seconds > LEAST_NOTICE / 2:  # else the measure is not worth its time
         seconds *= measure_slowness(threads)
-    return seconds if seconds >= LEAST_TOLD else None
+    return seconds if seconds >= LEAST_NOTICE else None

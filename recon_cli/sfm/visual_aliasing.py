@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
+from recon_cli.workspace.json_record import JsonRecord
 
 # A point is expected in an image that sees it as nearly as another does: SIFT finds it again, while
 # at 20 degrees one in six is lost (Lowe 2004, fig. 9).
@@ -43,7 +44,7 @@ BANDS_DEG = (2.5, 5.0, 7.5)
 # A smaller share found within the groups is taken for this one: then they are wrong themselves.
 MIN_RATE = 0.6
 MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
-# A smaller share of the cameras is no half of a doubled place: blurred images match badly too.
+# A smaller share of the cameras is not half of a doubled place: blurred images match badly too.
 MIN_SIDE = 0.1
 
 
@@ -59,7 +60,7 @@ class Overlap:
 
 
 @dataclass(frozen=True)
-class VisualAliasing:
+class VisualAliasing(JsonRecord):
     """The two groups of images that show least of what they should show in common."""
 
     # Of the cells that should look alike, those that do, over the same for pairs within the groups;
@@ -128,7 +129,7 @@ def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
         if shares.min() < share:
             cut, share = order[:int(shares.argmin()) + 1], float(shares.min())
     if cut is None:
-        reason = f"no two groups of cameras should show the same in {MIN_CELLS} places"
+        reason = f"no two groups of cameras should share {MIN_CELLS} places"
         return VisualAliasing(None, reason, ((), ()), 0)
     side = np.zeros(len(rows), np.bool_)
     side[cut] = True

@@ -25,6 +25,7 @@ from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
 from recon_cli.sfm.limits import MIN_EXPLAINED, MIN_ONE_POINT, MIN_PAIR_INLIERS, MIN_POSE_INLIERS
 from recon_cli.sfm.view_graph import Cut, Weights
+from recon_cli.workspace.json_record import JsonRecord
 
 # Images that each one has most matches with.
 STRONGEST = 5
@@ -37,10 +38,10 @@ MAX_OUTLIERS = 0.1
 
 
 @dataclass(frozen=True)
-class WeakestCut:
+class WeakestCut(JsonRecord):
     """The cut through a model across which matches least show the same points."""
 
-    # Of the matches of a pair of images across, those that show one point of the model, as far as
+    # Of the matches of a pair of images across, the share that shows one point of the model, where
     # their keypoints show any: the median of the pairs that count; None if unknown.
     share: float | None
     # Of the matches of those pairs, the share that the cameras explain: of all together or the
@@ -56,33 +57,33 @@ class WeakestCut:
 
 
 @dataclass(frozen=True)
-class OutlierCamera:
+class OutlierCamera(JsonRecord):
     """A camera that the image's own matches contradict."""
 
     name: str
-    share: float  # of its matches with cameras that are no outliers, those that agree
+    share: float  # of its matches with cameras that are not outliers, those that agree
     matches: int  # with such cameras
-    rival: str = ""  # of those, the one that contradicts it by most matches; empty without any
-    joined: float | None = None  # of what both show, the share that is one point in both
+    rival: str  # of those, the one that contradicts it by most matches; empty without any
+    joined: float | None  # of what both show, the share that is one point in both
 
     @property
     def reason(self) -> str:
         """What it contradicts, in words."""
-        text = f"{self.share:.0%} of its {self.matches} matches agree with where it was placed"
+        text = f"{self.share:.0%} of its {self.matches} matches agree with its pose"
         if self.joined is None:
             return text
-        return f"{text}, but {self.joined:.0%} of what {self.rival} shows too is one point in both"
+        return f"{text}, and only {self.joined:.0%} of those with {self.rival} show one point"
 
 
 def find_weakest_cut(
     evidence: MatchEvidence, order: NDArray[np.int64] | None = None
 ) -> tuple[WeakestCut, tuple[OutlierCamera, ...]]:
-    """Returns the weakest cut of the cameras that are no outliers, and the outliers.
+    """Returns the weakest cut of the cameras without the outliers, and the outliers.
 
     `order` are the images with a camera as they were taken, where that is known. Wrong cameras and
     other small sides of broken cuts are removed one by one, so that none hides behind another.
     """
-    links = _Links.of(evidence)
+    links = _Links.from_evidence(evidence)
     allowed = max(1, int(MAX_OUTLIERS * np.count_nonzero(evidence.registered)))
     inliers = _drop_wrong_cameras(links, evidence.registered, allowed)
     while (weakest := _weakest_side(links, inliers, order)) is not None:
@@ -139,7 +140,7 @@ class _Links:
     shares: Weights  # of the matches, those that show one point; NaN where too few show any
 
     @classmethod
-    def of(cls, evidence: MatchEvidence) -> _Links:
+    def from_evidence(cls, evidence: MatchEvidence) -> _Links:
         """Returns the matrices; matches of images without a camera are left out."""
         count, placed = len(evidence.names), evidence.placed
         pairs = evidence.pairs[placed]

@@ -47,7 +47,7 @@ def measured(
     seconds = summary.seconds
     rows: dict[str, object] = {
         name: value for name, value in summary.to_json().items() if name in SHOWN}
-    rows["rungs"] = ", ".join(rung.name for rung in summary.rungs)
+    rows["attempts"] = ", ".join(attempt.name for attempt in summary.attempts)
     if reference is not None:
         errors = compare(model_poses(out / "sparse"), reference_poses(reference))
         rows |= {

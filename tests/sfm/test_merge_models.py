@@ -130,7 +130,7 @@ def astray(truth, name):
 
 def test_where_many_cameras_are_suspected_the_model_is_left_as_it_is(fresh_capture, monkeypatch):
     job, truth = fresh_capture
-    suspects = tuple(OutlierCamera(name, 0.1, 200) for name in job.names[:5])
+    suspects = tuple(OutlierCamera(name, 0.1, 200, "", None) for name in job.names[:5])
     say(monkeypatch, lambda _: Opinion(trusted=False, outliers=suspects))
     found = merge_models.best_model(job, [pycolmap.Reconstruction(truth)])
     assert found.model.num_reg_images() == 20
