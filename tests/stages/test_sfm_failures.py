@@ -140,7 +140,7 @@ def test_models_that_are_left_aside_are_told(caplog):
 def test_frames_without_a_camera_are_told(caplog):
     text = told(caplog, unregistered_held_out=("3.png",))
     assert_facts(text, "without a camera", "11 of 60 frames", "0.png to 10.png (0.0 to 1.0 s)")
-    assert_facts(text, 1, "held-out", "3.png")
+    assert_facts(text, 1, "Held-out", "3.png")
 
 
 def test_where_there_is_a_verdict_it_speaks_of_the_missing_frames(caplog):
