@@ -23,7 +23,7 @@ WORLD = WorldSummary(
 SFM = SfmSummary(
     frames=12, registered=9, points=100, mean_track_length=3.0, reprojection_error_px=0.5,
     median_triangulation_angle_deg=9.0, poses=None, models=(9,), apart=(), rejected={},
-    verdict={"trusted": True}, lines=(), rungs=(), seconds={}, unregistered=(),
+    verdict={"trusted": True}, lines=(), attempts=(), seconds={}, unregistered=(),
     unregistered_held_out=(), world=WORLD, cameras=())
 INGEST = IngestSummary(
     kind="video", declared_frames=20, decoded_frames=20, lost_frames=0, dropped_blurred=0,

@@ -26,7 +26,7 @@ LOOSE_EV = 3.0  # keeps photos of unknown exposure near the others
 REACH = 4  # each photo is compared with so many that follow
 FEATURES = 1500  # the strongest: pairs of neighbours then share hundreds, at 20 ms a pair
 PIXELS_KEPT = 20_000  # of each photo, enough for a percentile
-MIN_MATCHES = 20  # below this, repeated things can agree on a geometry by chance
+MIN_DISTINCT = 20  # below this, repeated things can agree on a geometry by chance
 EPIPOLAR_PIXELS = 1.5  # of the small view: room for a lens that is not undistorted
 # Between the quartiles of a pair's ratios: at most 0.43 EV over 40 pairs of a rendered room that
 # overlap well, at least 0.6 EV, mostly above 1, over the 14 whose matches were chance.
@@ -141,7 +141,7 @@ def _compare_pairs(photos: Sequence[RawMeasures]) -> Pairs:
             at, matched = _matches(photos[a], photos[b])
             brighter = photos[b].levels[matched] - photos[a].levels[at]
             brighter = brighter[np.isfinite(brighter)]
-            if len(brighter) < MIN_MATCHES:
+            if len(brighter) < MIN_DISTINCT:
                 continue
             low, middle, high = np.quantile(brighter, [0.25, 0.5, 0.75])
             if high - low <= AGREED_EV:
@@ -154,12 +154,12 @@ def _matches(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Returns indices of matches in both photos, [M] each, that fit one epipolar geometry."""
     none = np.empty(0, np.int64), np.empty(0, np.int64)
-    if len(first.points) < MIN_MATCHES or len(second.points) < MIN_MATCHES:
+    if len(first.points) < MIN_DISTINCT or len(second.points) < MIN_DISTINCT:
         return none
     nearest = cv2.BFMatcher().knnMatch(
         first.descriptors.astype(np.float32), second.descriptors.astype(np.float32), k=2)
     distinct = [(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < RATIO * n.distance]
-    if len(distinct) < MIN_MATCHES:
+    if len(distinct) < MIN_DISTINCT:
         return none
     at, matched = np.array(distinct, np.int64).T
     _, inliers = cv2.findFundamentalMat(

@@ -62,8 +62,8 @@ class DepthScale:
     center: tuple[float, float, float]  # of the training cameras
     reach: float  # Gaussians farther than this from `center` count as no surface
 
-    def to_json(self) -> dict[str, Any]:
-        """Returns the scale for readers of the pictures."""
+    def describe_pictures(self) -> dict[str, Any]:
+        """Returns what the numbers of the pictures mean, for their readers."""
         return {
             "unit": "millimetre" if self.metres else "thousandth of the scene's extent",
             "world_units_per_step": self.step, "nothing": 0, "this_or_farther": FARTHEST,

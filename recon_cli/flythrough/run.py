@@ -171,7 +171,7 @@ def render_frames(request: RenderRequest, job: Job) -> str:
         scale = depth_scale(trained.scene, metres=trained.metres)
         missing = frames.prepare(
             _frame_settings(request, plan, trained, scale) | (
-                {} if trust is None else {"trust": trust.to_json()}),
+                {} if trust is None else {"trust": trust.describe_pictures()}),
             {"device": ctx.device, "backend": ctx.backend})
         if plan.path is not None:
             write_camera_path(folder / PATH, plan.path)
@@ -248,7 +248,7 @@ def _frame_settings(
         "cameras": sha256_json({
             name: [camera.fx, camera.fy, camera.cx, camera.cy, camera.viewmat.tolist()]
             for name, camera in cameras.items()}),
-        "depth": scale.to_json() if DEPTH in request.outputs else None,
+        "depth": scale.describe_pictures() if DEPTH in request.outputs else None,
     }
 
 

@@ -10,15 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from recon_cli.errors import SfmError, list_names
-
-MIN_FRAMES = 3
-# COLMAP accepts a pair of images from 15 inliers on.
-MIN_KEYPOINTS = 15
-# Share of verified matches in pairs explained by one homography: a turn on the spot, a flat wall.
-# Measured: 0.03 to 0.38 around rooms, 0.50 in a short walk, 0.99 and 1.00 in turns on the spot.
-MAX_FLAT_SHARE = 0.9
-# COLMAP drops points below 1.5. Medians: 7 to 23 in good captures, 3.9 in one that failed.
-MIN_ANGLE_DEG = 2.0
+from recon_cli.sfm.limits import MAX_FLAT_SHARE, MIN_FRAMES, MIN_PAIR_INLIERS, MIN_PARALLAX_DEG
 
 _MOVE = (
     "Record again while walking: move the camera sideways around the room instead of turning on "
@@ -27,12 +19,12 @@ _MOVE = (
 
 def check_texture(keypoints: Mapping[str, int]) -> None:
     """Raises SfmError when fewer than three frames have enough features to be matched."""
-    usable = sum(count >= MIN_KEYPOINTS for count in keypoints.values())
+    usable = sum(count >= MIN_PAIR_INLIERS for count in keypoints.values())
     if usable >= MIN_FRAMES:
         return
     raise SfmError(
         f"No features: {usable} of {len(keypoints)} frames show any texture, but at least "
-        f"{MIN_FRAMES} are needed.",
+        f"{MIN_FRAMES} must.",
         hint="Record again with more light and with furniture in view: bare walls and darkness "
         "cannot be matched.")
 
@@ -71,7 +63,7 @@ def check_registered(
 
 def shows_depth(median_angle_deg: float) -> bool:
     """Returns whether the points are seen from places far enough apart."""
-    return median_angle_deg >= MIN_ANGLE_DEG
+    return median_angle_deg >= MIN_PARALLAX_DEG
 
 
 def check_parallax(median_angle_deg: float) -> None:
@@ -79,5 +71,5 @@ def check_parallax(median_angle_deg: float) -> None:
     if not shows_depth(median_angle_deg):
         raise SfmError(
             f"The camera did not move enough: half of the points are seen at angles below "
-            f"{median_angle_deg:.1f} degrees, but {MIN_ANGLE_DEG:g} are needed.",
+            f"{median_angle_deg:.1f} degrees, but {MIN_PARALLAX_DEG:g} are needed.",
             hint=_MOVE)

@@ -56,7 +56,7 @@ def seal(path: Path) -> None:
 
 
 def unseal(path: Path) -> None:
-    """Deletes the digests of a database that no later run will go on from."""
+    """Deletes the digests of a database that no later run continues."""
     layout.remove(_digests_path(path))
 
 

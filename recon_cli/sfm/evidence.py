@@ -18,15 +18,13 @@ from scipy.sparse import csr_matrix
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database as database_file
+from recon_cli.sfm.limits import MAX_ERROR_PX, MIN_PAIR_EXPLAINED
 
-# A match agrees below the Sampson error, in pixels, at which COLMAP accepted it
-# (TwoViewGeometryOptions.ransac.max_error).
-MAX_ERROR = 4.0
 # It is explained by a point seen within this multiple of the model's mean error of it, within these
 # pixels: sharp videos come to .2 and shaken ones to 1. See `tests/bench/bench_verdict.py`.
-USUAL_OFFSET, OFFSETS = 6.0, (2.0, MAX_ERROR)
-CONTRADICTED = 0.5  # a pair of whose matches the poses explain a smaller share contradicts them
-NEAREST = 0.3  # of the depth that a twentieth of an image's points lie within: none are nearer
+USUAL_OFFSET, OFFSETS = 6.0, (2.0, MAX_ERROR_PX)
+# Of the depth that a twentieth of an image's points lie within: none are nearer.
+NEAREST_DEPTH = 0.3
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,8 @@ class MatchEvidence:
     tried: NDArray[np.bool_]  # [N, N], symmetric: pairs that were matched, successfully or not
     pairs: NDArray[np.int64]  # [P, 2], verified pairs of images, first < second, sorted
     matches: NDArray[np.int64]  # [P], verified matches of each pair
-    # [P], those within MAX_ERROR of the epipolar lines of the poses; zero where a camera is missing
+    # [P], those within MAX_ERROR_PX of the epipolar lines of the poses; zero where a camera is
+    # missing
     agreeing: NDArray[np.int64]
     explained: NDArray[np.int64]  # [P], those that the poses explain; likewise
     traced: NDArray[np.int64]  # [P], matches of which both keypoints show a point of the model
@@ -156,7 +155,7 @@ def explained_matches(
     points = at_infinity + np.clip(inverse, 0, most)[:, None] * motion.translation
     places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
     errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
-    return np.asarray(errors <= offset)  # NaN, behind the camera, is no agreement
+    return np.asarray(errors <= offset)  # NaN, behind the camera, does not agree
 
 
 def lift_rays(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -185,7 +184,7 @@ def seen_depths(
 
 def nearest_depth(depths: NDArray[np.float64]) -> float:
     """Returns a depth that no point is nearer than, from those of many points; 0 without any."""
-    return NEAREST * float(np.percentile(depths, 5)) if len(depths) else 0.0
+    return NEAREST_DEPTH * float(np.percentile(depths, 5)) if len(depths) else 0.0
 
 
 def _count_agreeing(
@@ -208,7 +207,7 @@ def _count_agreeing(
             rays[first][rows[:, 0]], rays[second][rows[:, 1]], essential))
         focal = (image.camera.mean_focal_length() + other.camera.mean_focal_length()) / 2
         # Not "<": two cameras in one place have no epipolar lines (NaN) and contradict nothing.
-        agreeing[pair] = len(rows) - np.count_nonzero(squares > (MAX_ERROR / focal) ** 2)
+        agreeing[pair] = len(rows) - np.count_nonzero(squares > (MAX_ERROR_PX / focal) ** 2)
     return agreeing
 
 
@@ -271,7 +270,7 @@ def _find_doubled(
     """Returns the points that the matches of contradicted pairs show, [K, 2], by row of a pair."""
     doubled = {}
     for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
-        if first in shown and second in shown and explained[pair] < CONTRADICTED * len(rows):
+        if first in shown and second in shown and explained[pair] < MIN_PAIR_EXPLAINED * len(rows):
             both = np.column_stack([shown[first][rows[:, 0]], shown[second][rows[:, 1]]])
             doubled[pair] = both[(both >= 0).all(axis=1)]
     return doubled

@@ -29,27 +29,25 @@ from recon_cli.sfm import (
     parts,
     skeleton,
 )
-from recon_cli.sfm.job import MappingJob, Reporter, Result, StepLog, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
+from recon_cli.sfm.limits import ENOUGH_FRAMES, MIN_FRAMES, MIN_ONE_POINT, MIN_PAIR_INLIERS
 from recon_cli.sfm.merge_models import ModelCandidate
+from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.time_estimate import format_minutes
 from recon_cli.sfm.trusted_part import cuts_models, deliver_parts
 from recon_cli.sfm.verdict import ModelVerdict, examine
-from recon_cli.sfm.weakest_cut import MIN_AGREEING
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 OTHERS = "others"  # in the folder of an attempt: its models that hold other frames, by number
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
-FEW = 30
-# Share of the reachable frames that a model must hold to end the search. Two rooms and 50 photos
-# held all of them; a slow walk that fell into four to seven models 76 to 82%.
-ENOUGH = 0.9
+FEW_PHOTOS = 30
 # How much longer than the longest attempt so far a mapping may take. Relaxed thresholds took 0.8
 # and 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
 # How many times as long as the attempt before it a further one usually takes (1.1 to 2.4 in three
-# captures), and the minutes of one from which on that is told.
+# captures), and the minutes of an attempt from which on the user is told.
 FURTHER, MINUTES_TOLD = 1.5, 0.5
 
 
@@ -81,7 +79,7 @@ class MapperAttempt(JsonRecord):
 
     @property
     def models(self) -> list[int]:
-        """Frames in the model and in what is left of the others."""
+        """Frames in the model, and those of the others that it lacks."""
         return [len(part) for part in (self.registered, *self.apart) if part]
 
     def summary(self, *, kept: bool) -> AttemptSummary:
@@ -96,7 +94,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     """Returns the ways to a model that a job allows, the quickest first."""
     count = len(job.names)
     if job.pairs != "auto":
-        return (_incremental(job.pairs, "it was asked for"),)
+        return (_incremental(job.pairs, "--pairs asks for it"),)
     relaxed = Fallback("relaxed", "", lambda *_: set(), mapper.map_relaxed)
     every = _incremental("exhaustive", f"{count} frames are few enough to match all pairs")
     ways: tuple[Fallback, ...] = (every, relaxed) if count <= matching.EXHAUSTIVE_MAX else (
@@ -107,20 +105,20 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     if skeleton.is_continuous(job):
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
-    elif count > FEW and not job.split and not job.segments:
-        ways = (Fallback("coarse", f"the coarsest features of {count} frames show which overlap",
+    elif count > FEW_PHOTOS and not job.split and not job.segments:
+        ways = (Fallback("coarse", f"the coarsest features of {count} frames show overlap",
                          skeleton.choose_coarse_pairs, skeleton.complete_coarse), *ways)
     if job.segments:
         joined = Fallback(
             SEGMENTS, f"{count} frames were mapped in {len(job.segments)} segments",
             lambda *_: set(), join_segments.map_joined)
-        if job.tracks is not None:  # as a whole it would take longer than all of its segments
+        if job.tracks is not None:  # mapped as one it would take longer than all of its segments
             return (joined,)
         ways = (joined, *ways)
     return (*ways, Fallback("global", "", lambda *_: set(), mapper.map_globally))
 
 
-def find_features(job: MappingJob, report: Reporter) -> Result:
+def find_features(job: MappingJob, report: Reporter) -> FeaturesResult:
     """Fills the database with the features of all frames; see `features.extract_features`."""
     if job.segments:
         join_segments.collect_features(job)
@@ -129,7 +127,7 @@ def find_features(job: MappingJob, report: Reporter) -> Result:
         return features.extract_features(job, report)
 
 
-def match_first(job: MappingJob, report: Reporter) -> Result:
+def match_first(job: MappingJob, report: Reporter) -> MatchesResult:
     """Matches the pairs of the first fallback; SfmError if none matches, or none shows depth."""
     if job.segments:
         return join_segments.match_segments(job, report)
@@ -138,7 +136,7 @@ def match_first(job: MappingJob, report: Reporter) -> Result:
     return matching.count_matches(job)
 
 
-def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result:
+def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelResult:
     """Writes the best model of all attempts that were needed into out/model.
 
     The matches of the first fallback are in the database. At `deadline`, in monotonic seconds, the
@@ -151,21 +149,19 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> Result
     ways = list_fallbacks(job)
     reason = ways[0].reason
     for fallback in ways:
-        recorded = log.result(fallback.name)
-        if recorded:
-            attempt = MapperAttempt.from_json(recorded)
-        else:
+        attempt = log.result(fallback.name, MapperAttempt)
+        if attempt is None:
             attempt, candidate = _try_fallback(job, fallback, reason, attempts, report, deadline)
             if candidate is not None:
                 verdicts[fallback.name] = candidate.verdict
-            log.finish(fallback.name, attempt.to_json(), job.attempts / fallback.name)
+            log.finish(fallback.name, attempt, job.attempts / fallback.name)
         attempts.append(attempt)
         if not attempt.skipped:
             reason = attempt.shortfall
             if not reason:
                 break
             if fallback is not ways[-1] and attempt.seconds > 60 * MINUTES_TOLD:
-                report.tell(f"another mapper is tried, for about "
+                report.tell(f"trying another mapper, for about "
                             f"{format_minutes(FURTHER * attempt.seconds)} more: {reason}")
     return _publish_best(job, attempts, verdicts)
 
@@ -176,7 +172,7 @@ def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
     Once all pairs are matched, these are only those that matches connect to it, directly or not.
     """
     counts = database.keypoint_counts(job.database)
-    textured = {name for name, count in counts.items() if count >= checks.MIN_KEYPOINTS}
+    textured = {name for name, count in counts.items() if count >= MIN_PAIR_INLIERS}
     if database.progress(job.database, "matches") < len(counts) * (len(counts) - 1) // 2:
         return textured
     held = set(mapper.list_registered(candidate.model))
@@ -187,11 +183,11 @@ def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
 def shortfall(candidate: ModelCandidate, reach: Collection[str]) -> str:
     """Returns why a model is not good enough, given the frames that it could hold; empty if not."""
     held = candidate.model.num_reg_images()
-    if held < ENOUGH * len(reach):
-        return f"only {held} of {len(reach)} frames that can be placed got a camera"
+    if held < ENOUGH_FRAMES * len(reach):
+        return f"only {held} of the {len(reach)} frames that can be registered were"
     apart = [names for names in candidate.apart if set(names).intersection(reach)]
     if apart:
-        return f"the capture fell into {1 + len(apart)} models"
+        return f"the capture split into {1 + len(apart)} disconnected models"
     if not candidate.verdict.trusted:
         return " ".join(candidate.verdict.problems)
     return ""
@@ -206,7 +202,7 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     """
     def quality(attempt: MapperAttempt) -> tuple[float, float]:
         link = attempt.weak_link if attempt.weak_link is not None else float(attempt.trusted)
-        link = link if attempt.trusted else min(link, MIN_AGREEING)
+        link = link if attempt.trusted else min(link, MIN_ONE_POINT)
         most = max(len(other.registered) for other in attempts)
         return (round(len(attempt.registered) / most * (0.5 + 0.5 * link), 2),
                 -(attempt.reprojection_error_px or 0.0))
@@ -223,8 +219,8 @@ def _try_fallback(
     start = time.monotonic()
     # Those of the first are matched.
     wanted = fallback.choose_pairs(job, report) if before else set()
-    matched = StepLog(job.out).result("matches") or {"seconds": 0.0, "rows": 0}
-    per_pair = float(matched["seconds"]) / max(1, int(matched["rows"]))
+    matched = StepLog(job.out).result("matches", MatchesResult)
+    per_pair = matched.seconds / max(1, matched.rows) if matched else 0.0
     expected = (len(wanted - database.pair_names(job.database)) * per_pair
                 + SLOWER * max((attempt.seconds for attempt in before), default=0.0))
     if before and start + expected > deadline:
@@ -233,7 +229,7 @@ def _try_fallback(
     if wanted:
         matching.match_pairs(job, wanted, report)
         database.seal(job.database)
-    job = _linked_job(job, fallback.name)
+    job = _with_own_matches(job, fallback.name)
     candidate = merge_models.best_model(
         job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS)
     seconds = round(time.monotonic() - start, 2)
@@ -253,7 +249,7 @@ def _try_fallback(
 
 def _publish_best(
     job: MappingJob, attempts: Sequence[MapperAttempt], verdicts: Mapping[str, ModelVerdict]
-) -> Result:
+) -> ModelResult:
     """Publishes the parts of the best model, and returns the result of the step."""
     chosen = best_attempt(attempts)
     registered = chosen.registered if chosen else ()
@@ -264,11 +260,11 @@ def _publish_best(
         counts = ", ".join(
             f"{attempt.name} was skipped for lack of time" if attempt.skipped else
             f"{attempt.name} found {len(attempt.registered)}" for attempt in attempts)
-        refused = "".join(f" {text}" for text in join_segments.read_refused(job))
+        refused = "".join(f" {text}" for text in join_segments.describe_refused_joins(job))
         raise SfmError(f"{error.message} Cameras by mapper: {counts}.{refused}",
                        hint=error.hint) from error
     assert chosen is not None  # three frames at least are registered
-    job = _linked_job(job, chosen.name)
+    job = _with_own_matches(job, chosen.name)
     folder = job.attempts / chosen.name
     model = pycolmap.Reconstruction(folder / "model")
     verdict = verdicts.get(chosen.name) or examine(
@@ -279,23 +275,23 @@ def _publish_best(
     parts.write_parts(job, [(part.model, part.verdict) for part in delivered])
     shutil.rmtree(job.attempts)
     held = {name for part in delivered for name in mapper.list_registered(part.model)}
-    apart = [sorted(set(names) - held) for names in chosen.apart]
-    return {
-        "parts": [parts.describe_part(part.model, part.verdict, held=held, rejected=part.rejected)
-                  for part in delivered],
-        "poses": None, "models": [len(chosen.registered), *chosen.models[1:]],
-        "apart": [names for names in apart if len(names) >= checks.MIN_FRAMES],
-        "broken": [] if job.accept_weak else list(verdict.problems),
-        "left_out": sorted(set(chosen.registered) - held),
-        "notes": join_segments.read_refused(job),
-        "rungs": [attempt.summary(kept=attempt is chosen).to_json() for attempt in attempts]}
+    apart = [tuple(sorted(set(names) - held)) for names in chosen.apart]
+    return ModelResult(
+        parts=tuple(parts.describe_part(
+            part.model, part.verdict, held=held, rejected=part.rejected) for part in delivered),
+        models=(len(chosen.registered), *chosen.models[1:]),
+        apart=tuple(names for names in apart if len(names) >= MIN_FRAMES),
+        broken=() if job.accept_weak else verdict.problems,
+        left_out=tuple(sorted(set(chosen.registered) - held)),
+        notes=join_segments.describe_refused_joins(job),
+        attempts=tuple(attempt.summary(kept=attempt is chosen) for attempt in attempts))
 
 
-def _linked_job(job: MappingJob, name: str) -> MappingJob:
+def _with_own_matches(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
-    own = job.attempts / name / skeleton.LINKED
+    own = job.attempts / name / skeleton.MATCHES_DB
     has_own = name == TRACKS or (name == SEGMENTS and job.tracks is not None)
-    return dataclasses.replace(job, linked=own) if has_own else job
+    return dataclasses.replace(job, matches_db=own) if has_own else job
 
 
 def _incremental(pairs: str, reason: str) -> Fallback:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.images import read_png
 from recon_cli.sfm import checks, database
-from recon_cli.sfm.job import MappingJob, Reporter, Result
+from recon_cli.sfm.job import MappingJob, Reporter
+from recon_cli.sfm.results import FeaturesResult
 
 # COLMAP's values but for the contrast, a difference of Gaussians times the number of layers: at its
 # value of .02 OpenCV finds a tenth fewer, at STRONG as many. In dim frames the strongest USUAL are
@@ -25,11 +26,11 @@ STRONG, CONTRAST, USUAL = 0.0133, 0.0067, 1000
 # An image is reduced by powers of two, to this many pixels of the longer side or more, where that
 # leaves this share of the features that are wanted at most: these are the coarsest, and found in a
 # quarter of the time.
-LEAST_SIZE, ENOUGH = 800, 0.5
+LEAST_SIZE, ENOUGH_FEATURES = 800, 0.5
 DESCRIPTOR_SCALE = 512.0  # of COLMAP's descriptors, which are the square roots of Lowe's (RootSIFT)
 
 
-def extract_features(job: MappingJob, report: Reporter) -> Result:
+def extract_features(job: MappingJob, report: Reporter) -> FeaturesResult:
     """Fills the database with the features of all frames and returns how many there are.
 
     Images that an interrupted run has finished are kept. FormatError if a frame cannot be read,
@@ -52,7 +53,7 @@ def extract_features(job: MappingJob, report: Reporter) -> Result:
             report.done(done)
     counts = database.keypoint_counts(job.database)
     checks.check_texture(counts)
-    return {"rows": len(counts), "keypoints": sum(counts.values())}
+    return FeaturesResult(rows=len(counts), keypoints=sum(counts.values()))
 
 
 def _find(job: MappingJob, name: str) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -71,7 +72,7 @@ def _find(job: MappingJob, name: str) -> tuple[NDArray[np.float32], NDArray[np.u
         # a reduced pixel counts where all that it covers do
         counts = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) == 255
         points = _strongest(sift.detect(image, np.uint8(255) * counts))
-        if len(points) >= ENOUGH * job.max_features:
+        if len(points) >= ENOUGH_FEATURES * job.max_features:
             break
     points.sort(key=lambda point: -point.size)
     points, rows = sift.compute(image, points[:job.max_features])

@@ -15,13 +15,13 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.gravity import find_gravity
 from recon_cli.scene.surfaces import find_floor
 
-WINDOW = 20  # images that are looked at together, and half of them further on again
+LOOKED_AT = 20  # images that are looked at together, and half of them further on again
 CONE_DEG = 8.0  # between the floor's normal and what is up for all cameras
 # Images on either side of a cut whose heights are compared, and how many must know theirs.
-NEAR, LEAST = 60, 10
+COMPARED, LEAST_HEIGHTS = 60, 10
 # Steps of the log of that height on good walks, as a standard deviation: .02 to .07 on eight, .05
 # by their squares. One larger than the other is to another surface, such as a table.
-SPREAD, MAX_STEP = 0.05, 0.4
+SPREAD, MAX_LOG_STEP = 0.05, 0.4
 
 
 def measure_heights(
@@ -42,8 +42,8 @@ def measure_heights(
     centers = np.array([image.projection_center() for image in images])
     shown = [{spot.point3D_id for spot in image.points2D if spot.has_point3D()}
              for image in images]
-    for start in range(0, len(images) - WINDOW // 2, WINDOW // 2):
-        rows = slice(start, start + WINDOW)
+    for start in range(0, len(images) - LOOKED_AT // 2, LOOKED_AT // 2):
+        rows = slice(start, start + LOOKED_AT)
         seen = set().union(*shown[rows])
         points = np.array([places[number] for number in sorted(seen)]).reshape(-1, 3)
         floor = find_floor(points, centers[rows], gravity.up, cone_deg=CONE_DEG)
@@ -60,8 +60,8 @@ def compare_heights(heights: NDArray[np.float64], place: int) -> float | None:
     None where too few of them know their height, or the surfaces are not the same.
     """
     before, behind = (side[~np.isnan(side)] for side in (
-        heights[max(0, place - NEAR):place], heights[place:place + NEAR]))
-    if min(len(before), len(behind)) < LEAST:
+        heights[max(0, place - COMPARED):place], heights[place:place + COMPARED]))
+    if min(len(before), len(behind)) < LEAST_HEIGHTS:
         return None
     step = float(np.log(np.median(behind) / np.median(before)))
-    return step if abs(step) <= MAX_STEP else None
+    return step if abs(step) <= MAX_LOG_STEP else None

@@ -6,7 +6,6 @@ on its standard output: a phase begins, so many of its units are done, or an err
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import threading
@@ -14,13 +13,21 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
-from recon_cli.errors import ConfigError, FormatError, ReconError, SfmError, WorkspaceError
+from recon_cli.errors import (
+    ConfigError,
+    FormatError,
+    ManifestError,
+    ReconError,
+    SfmError,
+    WorkspaceError,
+)
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace import atomic, layout
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.journal import crc32
+from recon_cli.workspace.json_record import JsonRecord
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 DATABASE = "database.db"  # in the stage's folder: COLMAP's, of features and matches
@@ -33,11 +40,9 @@ SPLIT = "split"  # a step after the matches where a view graph is cut into segme
 _SELF = "self"  # in the log, beside the steps: its own checksum
 _ORDER = (*STEPS[:2], SPLIT, *STEPS[2:])
 
-Result = dict[str, Any]  # JSON values only
-
 
 @dataclass(frozen=True)
-class CameraGroup:
+class CameraGroup(JsonRecord):
     """Frames that share one camera."""
 
     names: tuple[str, ...]  # sorted
@@ -48,7 +53,7 @@ class CameraGroup:
 
 
 @dataclass(frozen=True)
-class MappingJob:
+class MappingJob(JsonRecord):
     """One run of the mapping process; see `SfmConfig` for the options."""
 
     frames: Path  # folder of the original frames; features are found in these
@@ -72,7 +77,7 @@ class MappingJob:
     sharpness: Mapping[str, float]  # by name, where known
     times: Mapping[str, float]  # presentation times in seconds by name, where known
     tracks: Path | None = None  # file of tracks through a video, see `io.tracks`
-    linked: Path | None = None  # database to map from, where it is not that of the features
+    matches_db: Path | None = None  # database to map from, where it is not that of the features
     # names of the frames of each segment that was mapped apart, in folders of `segments`
     segments: tuple[tuple[str, ...], ...] = ()
     split: int = 0  # segments to cut the view graph into; none where 0
@@ -87,7 +92,7 @@ class MappingJob:
     @property
     def database(self) -> Path:
         """COLMAP's database of features and matches."""
-        return self.linked or self.out / DATABASE
+        return self.matches_db or self.out / DATABASE
 
     @property
     def parts(self) -> Path:
@@ -124,39 +129,20 @@ class MappingJob:
 
     def write(self, path: Path) -> None:
         """Writes the job for the mapping process."""
-        atomic.write_json(path, {
-            name: str(value) if isinstance(value, Path) else value
-            for name, value in dataclasses.asdict(self).items()})
+        atomic.write_json(path, self.to_json())
 
     @classmethod
     def read(cls, path: Path) -> MappingJob:
         """Returns the job that `write` wrote; raises FormatError for any other file."""
-        value = atomic.read_json(path, dict)
         try:
-            if value.keys() != cls.__dataclass_fields__.keys():
-                raise KeyError("fields")
-            return cls._of(value)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            return cls.from_json(atomic.read_json(path, dict))
+        except ManifestError as error:
             raise FormatError(
-                f"{path} is no mapping job.",
+                f"{path} is not a mapping job: {error.message}.",
                 hint="`recon sfm` writes the jobs of segments; give it one of those.") from error
 
-    @classmethod
-    def _of(cls, value: dict[str, Any]) -> MappingJob:
-        """Returns the job of JSON values; what `read` catches where they are of other types."""
-        for name in ("frames", "denoised", "out"):
-            value[name] = Path(value[name])
-        for name in ("masks", "poses", "tracks", "linked"):
-            value[name] = None if value[name] is None else Path(value[name])
-        for group in value["groups"]:
-            if (lens := group["lens"]) is not None:
-                group["lens"] = Lens(**{**lens, "params": tuple(lens["params"])})
-        value["groups"] = tuple(
-            CameraGroup(**{**group, "names": tuple(group["names"])}) for group in value["groups"])
-        value["segments"] = tuple(map(tuple, value["segments"]))
-        scale = value["scale_between"]
-        value["scale_between"] = None if scale is None else tuple(scale)
-        return cls(**value)
+
+Record = TypeVar("Record", bound=JsonRecord)
 
 
 class StepLog:
@@ -172,19 +158,24 @@ class StepLog:
         if steps.pop(_SELF, None) == sha256_json(steps):
             self._steps = steps
 
-    def result(self, step: str) -> Result | None:
-        """Returns the recorded result of a step whose files are all there, else None."""
+    def is_finished(self, step: str) -> bool:
+        """Returns whether a step was finished and its files are all there."""
         entry = self._steps.get(step)
-        if entry is None or any(
-            not (self._out / name).is_file() or (self._out / name).stat().st_size != size
-            for name, (size, _) in entry["files"].items()
-        ):
+        return entry is not None and all(
+            (self._out / name).is_file() and (self._out / name).stat().st_size == size
+            for name, (size, _) in entry["files"].items())
+
+    def result(self, step: str, kind: type[Record]) -> Record | None:
+        """Returns the recorded result of a finished step, else None, as for another version's."""
+        if not self.is_finished(step):
             return None
-        result: Result = entry["result"]
-        return result
+        try:
+            return kind.from_json(self._steps[step]["result"])
+        except ManifestError:
+            return None
 
     def finish(
-        self, step: str, result: Result, folder: Path | None = None, also: Sequence[str] = ()
+        self, step: str, result: JsonRecord, folder: Path | None = None, also: Sequence[str] = ()
     ) -> None:
         """Records a step as finished, with its result and the files in the `folder` it wrote.
 
@@ -192,14 +183,14 @@ class StepLog:
         """
         besides = [path for path in (self._out / name for name in also) if path.is_file()]
         files = digest_files(self._out, [*(() if folder is None else _files(folder)), *besides])
-        self._steps[step] = {"result": result, "files": files}
+        self._steps[step] = {"result": result.to_json(), "files": files}
         self._write()
 
     def find_damage(self) -> str | None:
         """Returns the first finished step with a file that was damaged since; None without one."""
         for step, entry in self._steps.items():
             names = [self._out / name for name in entry["files"]]
-            if self.result(step) is None or digest_files(self._out, names) != entry["files"]:
+            if not self.is_finished(step) or digest_files(self._out, names) != entry["files"]:
                 return step
         return None
 
@@ -213,16 +204,13 @@ class StepLog:
         """Returns the names of the files of a finished step; none if it is not finished."""
         return list(self._steps.get(step, {}).get("files", ()))
 
-    def hand_on(self, out: Path, last: str, facts: Result) -> None:
-        """Writes the steps up to `last` into another folder, whose files are there.
-
-        The result of the last one gets `facts` besides.
+    def copy_to(self, out: Path, last: str, result: JsonRecord) -> None:
+        """Writes the steps up to `last`, with another result of it, to a folder with their files.
         """
         names = [name for name in _ORDER[:_ORDER.index(last) + 1] if name in self._steps]
         other = StepLog(out)
         other._steps = {name: self._steps[name] for name in names}
-        entry = self._steps[last]
-        other._steps[last] = {**entry, "result": {**entry["result"], **facts}}
+        other._steps[last] = {**self._steps[last], "result": result.to_json()}
         other._write()
 
     def _write(self) -> None:

@@ -22,26 +22,32 @@ from recon_cli.io.tracks import Tracks
 from recon_cli.scene.covisibility import cut_graph
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm import database, mapper, matching, merge_models, skeleton
-from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.keyframes import choose_keyframes, name_keyframes
+from recon_cli.sfm.limits import MAX_TENSION
 from recon_cli.sfm.loop_closure import Node, bend_segments, move_frames
 from recon_cli.sfm.pair_checks import check_pairs, list_views
+from recon_cli.sfm.results import MatchesResult, SplitResult
 from recon_cli.sfm.segment_joins import (
-    MAX_TENSION,
     Join,
     Placement,
-    SharedPoints,
     judge_join,
     place_segments,
 )
-from recon_cli.sfm.segment_points import Segment, describe_segment, find_shared_points
 from recon_cli.sfm.segments import overlap
+from recon_cli.sfm.shared_points import (
+    Segment,
+    SharedPoints,
+    choose_owners,
+    describe_segment,
+    find_shared_points,
+)
 from recon_cli.sfm.view_overlap import overlapping_images
 from recon_cli.workspace import atomic
 
 Pair = matching.Pair
 
-REPORT = "segments.json"  # in the stage's folder: what the segments and their joins said
+REPORT = "segments.json"  # in the stage's folder: the segments, and the evidence of their joins
 MODEL_FOLDER = "parts/1"
 # Frames of other segments that each is matched with because they look alike: enough to find loops,
 # whose frames are matched with more of each other once the segments lie beside each other.
@@ -49,14 +55,14 @@ ALIKE = 2
 # Frames of other segments that each is matched with because it should see the same, those that look
 # alike included. Segments are rigid already: on 1,200 frames, 8 besides those end at an error of
 # .106% of the extent in 1,621 CPU seconds, 4 with them at .112% in 1,422.
-OVERLAPPING = 4
-# Adjustments of the whole with new points in between; segments have settled by themselves before.
+OVERLAPPING_SEGMENTS = 4
+# Adjustments of all with new points in between; segments have settled by themselves before.
 # On 300 frames five take a tenth longer for an error of 3.25 cm in place of 3.29.
-ROUNDS = 2
+JOIN_ROUNDS = 2
 
 
 def collect_features(job: MappingJob) -> None:
-    """Copies the features that segments found into the database of the whole."""
+    """Copies the features of the segments into the database of the capture."""
     paths = [job.segment(index) / "database.db" for index in range(len(job.segments))]
     sources = [path for path in paths if _is_intact(job, path)]
     with pycolmap.Database.open(job.database) as opened, pycolmap.DatabaseTransaction(opened):
@@ -87,7 +93,7 @@ def _is_intact(job: MappingJob, path: Path) -> bool:
 
 
 def collect_matches(job: MappingJob) -> None:
-    """Copies the matches that segments found into the database of the whole."""
+    """Copies the matches of the segments into the database of the capture."""
     for index in range(len(job.segments)):
         path = job.segment(index) / "database.db"
         if _is_intact(job, path):
@@ -120,7 +126,7 @@ def copy_matches(path: Path, target: Path, names: Sequence[str] | None = None) -
             opened.write_two_view_geometry(first, second, geometry)
 
 
-def match_segments(job: MappingJob, report: Reporter) -> Result:
+def match_segments(job: MappingJob, report: Reporter) -> MatchesResult:
     """Matches frames of different segments that look alike, besides what segments have matched."""
     collect_matches(job)
     known = _inner_pairs(job.segments)
@@ -139,7 +145,7 @@ def _inner_pairs(segments: Sequence[Sequence[str]]) -> set[Pair]:
     return {pair for names in segments for pair in itertools.combinations(sorted(names), 2)}
 
 
-def split_by_view_graph(job: MappingJob) -> Result:
+def split_by_view_graph(job: MappingJob) -> SplitResult:
     """Cuts the frames of a job into segments where few matches tie them.
 
     Each also gets the frames of others that most of its matches lead to. The features and matches
@@ -148,7 +154,7 @@ def split_by_view_graph(job: MappingJob) -> Result:
     names, count = job.names, job.split
     row = {name: index for index, name in enumerate(names)}
     weights = np.zeros((len(names), len(names)))
-    for (first, second), geometry in skeleton.read_verified(job.database).items():
+    for (first, second), geometry in matching.read_verified(job.database).items():
         weights[row[first], row[second]] = len(geometry.inlier_matches)
     weights += weights.T
     labels = cut_graph(weights, count)
@@ -164,11 +170,11 @@ def split_by_view_graph(job: MappingJob) -> Result:
     job = dataclasses.replace(job, segments=tuple(map(tuple, segments)))
     for index in range(count):
         _seed_database(job, index)
-    return {"segments": segments}
+    return SplitResult(segments=job.segments)
 
 
 def _seed_database(job: MappingJob, index: int) -> None:
-    """Writes the database of a segment, with the features and matches of the whole."""
+    """Writes the database of a segment, with the features and matches of the capture."""
     names, folder = job.segments[index], fresh_folder(job.segment(index))
     segment = dataclasses.replace(job, out=folder, groups=tuple(
         dataclasses.replace(group, names=inside) for group in job.groups
@@ -230,7 +236,7 @@ def join_all(
             return joins, groups
         joins = [dataclasses.replace(
             join, motion=None, contradictions=(
-                *join.contradictions, "no bending of the two brings their common frames together"))
+                *join.contradictions, "bending the two cannot bring their common frames together"))
             if (join.first, join.second) in torn else join for join in joins]
 
 
@@ -257,12 +263,7 @@ class JoinedModel:
 def join_models(segments: Sequence[Segment], group: SegmentGroup) -> JoinedModel:
     """Returns the segments of a group, their models copied and moved."""
     members = [segment for segment in segments if segment.index in group.indices]
-    owner: dict[str, Segment] = {}
-    for segment in members:
-        for name, shown in segment.shown.items():
-            best = owner.get(name)
-            if best is None or len(shown.rows) > len(best.shown[name].rows):
-                owner[name] = segment
+    owner = choose_owners(members)
     return JoinedModel(tuple(
         (move_frames(segment.model, {
             name: group.motions[segment.index, name] for name in segment.cameras.names}),
@@ -273,10 +274,10 @@ def join_models(segments: Sequence[Segment], group: SegmentGroup) -> JoinedModel
 def map_joined(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the model of the largest group of segments, and after it those of the other groups.
 
-    `job.linked` names the database that is written and mapped from, where there are tracks.
+    `job.matches_db` names the database that is written and mapped from, where there are tracks.
     """
     largest, *others = _join(job, report)
-    source = dataclasses.replace(job, linked=None)
+    source = dataclasses.replace(job, matches_db=None)
     fitted = _fit(job, largest)
     if job.tracks is not None:
         fitted = skeleton.close_loops(job, report, fitted)
@@ -285,7 +286,7 @@ def map_joined(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstructio
 
 def _join(job: MappingJob, report: Reporter) -> list[JoinedModel]:
     """Returns the groups of segments, and writes what joined them; what else was read is freed."""
-    source = dataclasses.replace(job, linked=None)
+    source = dataclasses.replace(job, matches_db=None)
     report.phase("joining", len(job.segments))
     collect_matches(source)
     segments = read_segments(job)
@@ -304,7 +305,7 @@ def _join_by_matches(
     job: MappingJob, segments: Sequence[Segment]
 ) -> tuple[list[Join], list[SegmentGroup], set[Pair]]:
     """Returns joins and groups by all matches so far, and the pairs that show common points."""
-    geometries = skeleton.read_verified(job.database)
+    geometries = matching.read_verified(job.database)
     common = find_shared_points(segments, geometries)
     joins, groups = join_all(
         segments, common, None if job.tracks is None else geometries, seed=job.seed)
@@ -323,7 +324,7 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
              if image.name in chosen]
     return overlapping_images(
         [image for image, _ in owned], [model for _, model in owned], held,
-        most=OVERLAPPING, besides=known)
+        most=OVERLAPPING_SEGMENTS, besides=known)
 
 
 def _images(model: pycolmap.Reconstruction, names: frozenset[str]) -> list[pycolmap.Image]:
@@ -346,28 +347,29 @@ def _posed(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
 
 def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
     """Returns the cameras of joined segments with the points that all matches give, adjusted."""
-    source = dataclasses.replace(job, linked=None)
-    if job.linked is not None:
-        geometries = skeleton.read_verified(source.database)
+    source = dataclasses.replace(job, matches_db=None)
+    if job.matches_db is not None:
+        geometries = matching.read_verified(source.database)
         checked = check_pairs(source.database, list_views(joined.parts), geometries)
         usable = {pair: geometry for pair, geometry in geometries.items()
                   if pair not in checked.contradicting}
         assert job.tracks is not None
         tracks = Tracks.read(job.tracks)
-        skeleton.link(job, source.database, usable, tracks, choose_keyframes(tracks))
+        skeleton.write_usable_matches(
+            job, source.database, usable, tracks, choose_keyframes(tracks))
     model = mapper.triangulate(job, _posed(job, joined), rounds=1)
     if model.num_reg_images() < len(job.names):
         model = mapper.extend_model(job, model, rounds=0)
-    mapper.refine(job, model, ROUNDS)
+    mapper.refine(job, model, JOIN_ROUNDS)
     return model
 
 
-def read_refused(job: MappingJob) -> list[str]:
+def describe_refused_joins(job: MappingJob) -> tuple[str, ...]:
     """Returns which joins of segments were not made, a sentence each; none without segments."""
     if not job.segments or not (job.out / REPORT).exists():
-        return []
+        return ()
     refused: list[str] = atomic.read_json(job.out / REPORT, dict)["refused"]
-    return [f"{text[:1].upper()}{text[1:]}." for text in refused]
+    return tuple(f"{text[:1].upper()}{text[1:]}." for text in refused)
 
 
 def _describe(

@@ -1,6 +1,6 @@
 """The frames of a long video that its tracks show to be needed.
 
-Neighbours that show nearly the same say nothing new of the scene. A skeleton is built from frames
+Neighbours that show nearly the same add nothing. A skeleton is built from frames
 that keep a good part of the tracks of the one before, and matches are sought between these; all
 others are placed by what they share with the two beside them.
 """
@@ -17,10 +17,10 @@ from recon_cli.sfm.matching import Pair
 
 ALL = 200  # frames up to which all are keyframes
 # Tracks that a keyframe shares with the next one: of its own, and at least. No step is longer.
-SHARED, LEAST, LONGEST = 0.5, 60, 6
+SHARED, LEAST_SHARED, LONGEST = 0.5, 60, 6
 # Tracks from which on two frames are worth matching: of 774 pairs with fewer, five to ten keyframes
 # apart, 58 were verified, of 285 with more, 122.
-FEW = 5
+FEW_TRACKS = 5
 
 
 def choose_keyframes(tracks: Tracks) -> tuple[int, ...]:
@@ -32,7 +32,7 @@ def choose_keyframes(tracks: Tracks) -> tuple[int, ...]:
     rows = [0]
     while rows[-1] < count - 1:
         last = rows[-1]
-        enough = max(LEAST, SHARED * seen[last])
+        enough = max(LEAST_SHARED, SHARED * seen[last])
         step = 1
         while (step < LONGEST and last + step < count - 1
                and len(tracks.matches(last, last + step + 1)[0]) >= enough):
@@ -61,13 +61,13 @@ def track_rows(rows: Sequence[int], steps: Sequence[int]) -> list[tuple[int, int
 
 
 def share_tracks(tracks: Tracks, pairs: Iterable[Pair]) -> set[Pair]:
-    """Returns the pairs of frames that have FEW tracks or more in common."""
+    """Returns the pairs of frames that have FEW_TRACKS tracks or more in common."""
     row = {name: index for index, name in enumerate(tracks.names)}
     return {(first, second) for first, second in pairs
-            if len(tracks.matches(row[first], row[second])[0]) >= FEW}
+            if len(tracks.matches(row[first], row[second])[0]) >= FEW_TRACKS}
 
 
 def side_pairs(tracks: Tracks) -> set[Pair]:
-    """Returns each frame that is no keyframe with the two keyframes beside it, by names."""
+    """Returns each frame that is not a keyframe with the two keyframes beside it, by names."""
     return {(tracks.names[first], tracks.names[second])
             for first, second in side_rows(choose_keyframes(tracks))}

@@ -21,30 +21,25 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database, features, mapper, matching, parts
 from recon_cli.sfm.evidence import gather_evidence
-from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
+from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
 from recon_cli.sfm.merge_models import build_posed_model
+from recon_cli.sfm.results import MatchesResult, ModelResult
 from recon_cli.sfm.verdict import check_weak_link, examine
 from recon_cli.workspace.records import KnownPoses, read_poses
+from recon_cli.workspace.summaries import PosesSummary
 
-NEAREST = 20  # cameras that each one is matched with, as in `matching.similar_pairs`
 # Axes further apart share little: the wider side of a phone's picture spans 65 to 80 degrees.
-MAX_TURN_DEG = 75.0
-# Share of the verified matches that the points must confirm. Nine rendered frames gave 0.76
-# with their true poses and at most 0.06 with axes of another convention or the names swapped.
-MIN_AGREEING = 0.2
+MAX_AXES_DEG = 75.0
 PLACES = 4  # of the spot check, spread over the images by name
 # Of the cameras nearest to each place: the next one, and one with a baseline that tells more.
 NEIGHBOURS = (0, 5)
 FEATURES = 1000  # keypoints an image
-MIN_MATCHES = 60  # fewer, in all pairs together, say nothing
-# Share of the matches that must lie on the epipolar lines of the poses. A room and a desk gave
-# .997 and more, wrong axes or other images .07 to .36 (tests/bench/bench_spot_check.py).
-MIN_SPOT_AGREEING = 0.5
 
 Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
 
 
-def match_known(job: MappingJob, report: Reporter) -> Result:
+def match_known(job: MappingJob, report: Reporter) -> MatchesResult:
     """Matches neighbours in the order of names, and cameras that stand and look alike."""
     poses = _read_poses(job).viewmats
     matching.match_pairs(job, near_pairs(poses) | matching.sequential_pairs(list(poses)), report)
@@ -57,7 +52,7 @@ def near_pairs(
     """Returns each image paired with the nearest that look in about the same direction."""
     return {
         (min(name, other), max(name, other))
-        for name, others in neighbours(viewmats).items() for other in others[:NEAREST]}
+        for name, others in neighbours(viewmats).items() for other in others[:matching.NEAREST]}
 
 
 def neighbours(
@@ -72,11 +67,11 @@ def neighbours(
         _, order = tree.query(center, k=len(names))
         nearest[names[row]] = [
             names[other] for other in np.atleast_1d(order).tolist()
-            if other != row and axes[row] @ axes[other] >= np.cos(np.radians(MAX_TURN_DEG))]
+            if other != row and axes[row] @ axes[other] >= np.cos(np.radians(MAX_AXES_DEG))]
     return nearest
 
 
-def build_known_model(job: MappingJob, report: Reporter) -> Result:
+def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     """Writes the model of the given cameras into out/model and returns what it holds.
 
     SfmError if too few frames have a pose, or the poses do not fit the images.
@@ -100,8 +95,8 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         matches = sum(count for _, count, _ in database.count_inliers(job.database))
         lengths = np.array([point.track.length() for point in model.points3D.values()])
         share = float((lengths * (lengths - 1) / 2).sum()) / max(1, matches)
-        if share < MIN_AGREEING:
-            raise _misfit(share, MIN_AGREEING)
+        if share < MIN_CONFIRMED:
+            raise _misfit(share, MIN_CONFIRMED)
         verdict = examine(
             model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times,
             given=True)
@@ -109,10 +104,10 @@ def build_known_model(job: MappingJob, report: Reporter) -> Result:
         notes = []
     parts.write_parts(job, [(model, verdict)])
     shutil.rmtree(job.attempts, ignore_errors=True)
-    return {
-        "parts": [parts.describe_part(model, verdict)], "notes": notes,
-        "models": [model.num_reg_images()], "apart": [], "rungs": [],
-        "poses": {"use": job.pose_use, "metric": known.metric, **movement}}
+    return ModelResult(
+        parts=(parts.describe_part(model, verdict),), notes=tuple(notes),
+        models=(model.num_reg_images(),),
+        poses=PosesSummary(use=job.pose_use, metric=known.metric, **movement))
 
 
 def _read_poses(job: MappingJob) -> KnownPoses:
@@ -233,7 +228,7 @@ class SpotCheck:
     def describe(self) -> str:
         """Returns a sentence for the terminal."""
         if self.share is None:
-            return f"The given poses could not be checked: {self.matches} matches are too few."
+            return f"The given poses could not be checked: too few matches ({self.matches})."
         return (f"{self.share:.0%} of {self.matches} matches between sampled images agree with the "
                 "given poses.")
 
@@ -266,4 +261,4 @@ def spot_check(
     except SfmError:  # hardly any texture
         matches, agreeing = 0, 0
     shutil.rmtree(sample.out)
-    return SpotCheck(matches, agreeing / matches if matches >= MIN_MATCHES else None)
+    return SpotCheck(matches, agreeing / matches if matches >= MIN_SPOT_MATCHES else None)

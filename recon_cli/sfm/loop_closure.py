@@ -16,27 +16,32 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.matching import Pair
-from recon_cli.sfm.pair_checks import MAX_DRIFT, MAX_DRIFT_DEG
-from recon_cli.sfm.pose_graph import Joints, Motions, Ties, bend, measure_ties
-from recon_cli.sfm.segment_joins import (
-    MAX_ERROR,
+from recon_cli.sfm.limits import (
+    MAX_DRIFT,
+    MAX_DRIFT_DEG,
+    MAX_POINT_ERROR,
     MAX_TENSION,
-    MAX_TRIALS,
-    MIN_INLIERS,
-    MIN_SHARE,
-    NEAR,
-    SAMPLED,
-    SharedPoints,
+    MIN_LOOP_SHARE,
+    NEAR_IN_WALK,
 )
-from recon_cli.sfm.segment_points import Segment, describe_segment, find_rows
+from recon_cli.sfm.matching import Pair
+from recon_cli.sfm.pose_graph import Joints, Motions, Ties, bend, measure_ties
+from recon_cli.sfm.segment_joins import SAMPLED
+from recon_cli.sfm.shared_points import (
+    Segment,
+    SharedPoints,
+    choose_owners,
+    describe_segment,
+    estimate_similarity,
+    join_matches,
+)
 from recon_cli.sfm.stiffness import RUN, measure_stiffness
 
 Geometries = Mapping[Pair, pycolmap.TwoViewGeometry]
 Node = tuple[int, str]  # a segment and a frame of it
 
 COMMON = 20  # points of a frame in common that are tied
-FEWEST = 5  # points of a pair in a loop
+FEWEST_TIED = 5  # points of a pair in a loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +57,8 @@ class BentSegments:
     """What became of segments that were bent into each other."""
 
     motions: Mapping[Node, Similarity]  # from the frame of a segment to the common one
-    tension: Mapping[tuple[int, int], float]  # of frames in common of two segments, in MAX_ERROR
+    # of frames in common of two segments, in MAX_POINT_ERROR
+    tension: Mapping[tuple[int, int], float]
     loops: tuple[Loop, ...]  # that were closed
 
 
@@ -116,12 +122,7 @@ class _Graph:
             (segment.index, name) for segment in segments for name in segment.cameras.names)}
         self._centers = np.concatenate(
             [start[segment.index].points(segment.cameras.centers) for segment in segments])
-        self._owner: dict[str, Segment] = {}  # that shows most of a frame
-        for segment in segments:
-            for name, shown in segment.shown.items():
-                best = self._owner.get(name)
-                if best is None or len(shown.rows) > len(best.shown[name].rows):
-                    self._owner[name] = segment
+        self._owner = choose_owners(segments)
         names = sorted(self._owner)
         self._place = {name: row for row, name in enumerate(names)}  # in the walk
         way = self._centers[[self.number[self._owner[name].index, name] for name in names]]
@@ -157,7 +158,7 @@ class _Graph:
                 np.column_stack([rows[:-1], rows[1:]]),
                 (self._centers[rows[:-1]] + self._centers[rows[1:]]) / 2,
                 stiff.scale, stiff.turn, stiff.shift * motion.scale))
-            chosen = _thin(stiff.loops // NEAR, SAMPLED)
+            chosen = _thin(stiff.loops // NEAR_IN_WALK, SAMPLED)
             points = motion.points(stiff.points[chosen])
             ties.append(Ties(rows[stiff.loops[chosen]], points, points,
                              np.full(len(chosen), self._unit(segment))))
@@ -165,7 +166,7 @@ class _Graph:
 
     def _unit(self, segment: Segment) -> float:
         """Returns how far apart equal points of a segment may be, in the common frame."""
-        return MAX_ERROR * segment.cameras.depth * self._start[segment.index].scale
+        return MAX_POINT_ERROR * segment.cameras.depth * self._start[segment.index].scale
 
     def _tie_common(self, shared: SharedPoints) -> Ties:
         """Returns ties between the frames that two segments have in common."""
@@ -194,16 +195,13 @@ class _Graph:
             return None
         one, other = (self._owner[name] for name in pair)
         ours, theirs = one.shown[pair[0]], other.shown[pair[1]]
-        left, right = (find_rows(shown.rows, geometry.inlier_matches[:, side])
-                       for side, shown in enumerate((ours, theirs)))
-        both = (left >= 0) & (right >= 0)
-        first, second = ours.points[left[both]], theirs.points[right[both]]
+        first, second = join_matches(ours, theirs, geometry.inlier_matches)
         if one is other:
             open_ones = (first != second).any(axis=1)
             if open_ones.sum() <= len(open_ones) / 2:
                 return None
             first, second = first[open_ones], second[open_ones]
-        if len(first) < FEWEST:
+        if len(first) < FEWEST_TIED:
             return None
         nodes = [self.number[one.index, pair[0]], self.number[other.index, pair[1]]]
         return Ties(np.tile(nodes, (len(first), 1)), self._start[one.index].points(first),
@@ -214,30 +212,23 @@ class _Graph:
         left = list(pairs)
         while left:
             places = np.array([[self._place[name] for name in pair] for pair in left])
-            near = (np.abs(places - places[len(left) // 2]) <= NEAR).all(axis=1)
+            near = (np.abs(places - places[len(left) // 2]) <= NEAR_IN_WALK).all(axis=1)
             yield [pair for pair, close in zip(left, near, strict=True) if close]
             left = [pair for pair, close in zip(left, near, strict=True) if not close]
 
     def _agree(self, pairs: Sequence[Pair], parts: Sequence[Ties], seed: int) -> Loop | None:
         """Returns the loop that most points of pairs say; None without one, or where no drift."""
         ties = Ties.joined(parts)
-        if len(pairs) < 2 or len(ties.unit) < MIN_INLIERS:
-            return None
         unit = float(np.median(ties.unit))
-        options = pycolmap.RANSACOptions()
-        options.max_error = unit
-        options.max_num_trials = MAX_TRIALS
-        options.random_seed = seed
-        estimate = pycolmap.estimate_sim3d_robust(ties.ours, ties.theirs, options)
-        if estimate is None or estimate["num_inliers"] < max(
-                MIN_INLIERS, MIN_SHARE * len(ties.unit)):
+        agreed = None if len(pairs) < 2 else estimate_similarity(
+            ties.ours, ties.theirs, max_error=unit, min_share=MIN_LOOP_SHARE, seed=seed)
+        if agreed is None:
             return None
-        rows = np.flatnonzero(estimate["inlier_mask"])
+        rows = agreed.rows
         shift = np.median(np.linalg.norm(ties.ours[rows] - ties.theirs[rows], axis=1))
         ends = np.array([[self._travelled[self._place[name]] for name in pair] for pair in pairs])
         way = float(np.median(np.abs(ends[:, 1] - ends[:, 0])))
-        turn = np.degrees(estimate["tgt_from_src"].rotation.angle())
-        if turn > MAX_DRIFT_DEG or shift > MAX_DRIFT * way:
+        if agreed.turn_deg > MAX_DRIFT_DEG or shift > MAX_DRIFT * way:
             return None
         rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), SAMPLED)).astype(int)]
         return Loop(tuple(pairs), Ties(ties.nodes[rows], ties.ours[rows], ties.theirs[rows],

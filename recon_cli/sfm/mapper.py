@@ -11,20 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap, write_model
-from recon_cli.sfm import checks, database
-from recon_cli.sfm.job import MappingJob, Reporter, Result, fresh_folder
+from recon_cli.sfm import database
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
+from recon_cli.sfm.limits import (
+    LOSS_SCALE,
+    MAX_ERROR_PX,
+    MIN_FRAMES,
+    MIN_IMAGES_PRINCIPAL,
+    MIN_RAY_ANGLE_DEG,
+    RELAXED_POSE_INLIERS,
+    RELAXED_POSE_SHARE,
+)
 
 # Threads add sums in any order; one gives the same bytes every time, for 5% more time on two cores.
 THREADS = 1
 # Growth after which all is adjusted again: 16.2 s on the sample, 20.0 s with COLMAP's 1.1.
 GLOBAL_RATIO = 1.2
-# Fewer images of a camera cannot tell its principal point from a turn (COLMAP: min_model_size).
-MIN_IMAGES_PRINCIPAL = 10
-# COLMAP's own limits for a point of a finished model: pixels, and degrees between two rays.
-MAX_ERROR, MIN_ANGLE = 4.0, 1.5
-# Times the mean error. Cameras of two rooms came out at .54 and .47 cm without, at .34 and .19 with
-# the first, at .16 and .09 with both; half and twice the scale change that by .02.
-SHARP_RATIO, LOSS_SCALE = 3.0, 0.5
+# Times the mean error, above which an observation does not count; see LOSS_SCALE. Half and twice
+# as much change the error of the cameras by .02 cm.
+SHARP_RATIO = 3.0
 # Relative change of the cost that ends an adjustment; a hundredth takes three times as long and
 # moves those cameras by less than .001 cm.
 TOLERANCE = 1e-4
@@ -159,7 +164,7 @@ def adjust(
     else:
         pycolmap.bundle_adjustment(model, options)
     # Nothing holds a point whose rays went parallel: one of 2,084 ended 1e153 away.
-    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_RAY_ANGLE_DEG)
     model.update_point_3d_errors()
 
 
@@ -194,7 +199,7 @@ def sharpen(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """
     error = model.compute_mean_reprojection_error()
     sharp = pycolmap.Reconstruction(model)
-    pycolmap.ObservationManager(sharp).filter_all_points3D(SHARP_RATIO * error, MIN_ANGLE)
+    pycolmap.ObservationManager(sharp).filter_all_points3D(SHARP_RATIO * error, MIN_RAY_ANGLE_DEG)
     if any(sharp.image(i).num_points3D < KEPT_SHARE * model.image(i).num_points3D
            for i in model.reg_image_ids()):
         sharp = pycolmap.Reconstruction(model)
@@ -219,18 +224,6 @@ def triangulate(
         refine_intrinsics)
     shutil.rmtree(job.attempts / MODELS)
     return triangulated
-
-
-def describe_model(model: pycolmap.Reconstruction) -> Result:
-    """Returns the contents of a model for the stage's summary; None for figures without tracks."""
-    tracks = model.compute_num_observations() > 0
-    return {
-        "registered": list_registered(model),
-        "points": model.num_points3D(),
-        "mean_track_length": model.compute_mean_track_length() if tracks else None,
-        "reprojection_error_px": model.compute_mean_reprojection_error() if tracks else None,
-        "median_triangulation_angle_deg":
-            float(np.median(triangulation_angles(model))) if tracks else None}
 
 
 def list_registered(model: pycolmap.Reconstruction) -> list[str]:
@@ -258,7 +251,7 @@ def _options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = THREADS
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job.seed
-    options.min_model_size = checks.MIN_FRAMES  # COLMAP's 10 would drop small captures
+    options.min_model_size = MIN_FRAMES  # COLMAP's 10 would drop small captures
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_RATIO
     options.ba_global_function_tolerance = TOLERANCE
     return options
@@ -271,11 +264,11 @@ def _relax(options: pycolmap.IncrementalPipelineOptions) -> None:
     with short steps. A fast turn past a bare wall leaves points of small angles alone.
     """
     mapper = options.mapper
-    mapper.filter_min_tri_angle = options.triangulation.min_angle = MIN_ANGLE / 2
+    mapper.filter_min_tri_angle = options.triangulation.min_angle = MIN_RAY_ANGLE_DEG / 2
     mapper.init_min_num_inliers = 50  # of 100
     mapper.init_min_tri_angle = 4.0  # of 16 degrees
-    mapper.abs_pose_min_num_inliers = 15  # of 30; a pair is verified from 15 on
-    mapper.abs_pose_min_inlier_ratio = 0.15  # of 0.25
+    mapper.abs_pose_min_num_inliers = RELAXED_POSE_INLIERS
+    mapper.abs_pose_min_inlier_ratio = RELAXED_POSE_SHARE
     mapper.max_reg_trials = 6  # of 3
     options.init_num_trials = 400  # of 200
 
@@ -283,7 +276,7 @@ def _relax(options: pycolmap.IncrementalPipelineOptions) -> None:
 def _global_options(job: MappingJob) -> pycolmap.GlobalPipelineOptions:
     options = pycolmap.GlobalPipelineOptions()
     mapper = options.mapper
-    options.min_model_size = checks.MIN_FRAMES
+    options.min_model_size = MIN_FRAMES
     options.num_threads = mapper.num_threads = THREADS
     mapper.bundle_adjustment.ceres.solver_options.num_threads = THREADS
     options.random_seed = mapper.random_seed = job.seed

@@ -17,24 +17,20 @@ from recon_cli.errors import FormatError, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.database import scales
-from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, Result
+from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.limits import MAX_TRIALS, MIN_DEEP_SHARE, MIN_PAIR_INLIERS
+from recon_cli.sfm.results import MatchesResult
 
 CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
 # COLMAP's default. With the powers of two an image also meets those 16, 32, ... 512 further on.
 SEQUENTIAL_OVERLAP = 10
-# Of COLMAP's 10000, mostly spent on pairs without anything in common. 2000 took a third off the
-# verification of five captures and lost 8 of 5700 verified pairs, but no image.
-MAX_TRIALS = 2000
-# Share of all verified matches that pairs at some distance must hold beside the flat ones to show
-# depth: pairs that hardly overlap look deep by chance.
-MIN_SHARE = 0.01
 # Similar images per image beside its neighbours. They hold 41% (10 hold 25%) of the other pairs
 # with 50 or more verified matches in a slow walk, 67% in a room, 80% in 50 photos.
 NEAREST = 20
 WORDS = 64  # 32, or all keypoints in place of the coarsest 1000, chose no better pairs
-COARSEST = 1000  # keypoints of an image, largest scale first: they are seen from more places
-SAMPLE = 20_000  # descriptors that k-means runs on
-ROUNDS = 10  # of k-means
+DESCRIBED = 1000  # keypoints of an image, largest scale first: they are seen from more places
+WORD_SAMPLE = 20_000  # descriptors that k-means runs on
+WORD_ROUNDS = 10  # of k-means
 # Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
 EXHAUSTIVE_MAX = 100
 CHUNK = 4096  # descriptors compared with the words at a time, to bound the memory
@@ -134,7 +130,7 @@ def _features(database: Path, names: Sequence[str]) -> list[NDArray[np.float32]]
         for name in names:
             rows = np.asarray(opened.read_descriptors(ids[name]).data, np.float32)
             largest = np.argsort(-scales(opened.read_keypoints(ids[name])), kind="stable")
-            rows = rows.reshape(-1, 128)[largest[:COARSEST]]
+            rows = rows.reshape(-1, 128)[largest[:DESCRIBED]]
             features.append(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
     return features
 
@@ -144,9 +140,9 @@ def _visual_words(
 ) -> NDArray[np.float32]:
     """Returns the centres that k-means finds, [W, 128]."""
     descriptors = np.concatenate(features)
-    sample = descriptors[generator.permutation(len(descriptors))[:SAMPLE]]
+    sample = descriptors[generator.permutation(len(descriptors))[:WORD_SAMPLE]]
     words = sample[:WORDS].copy()
-    for _ in range(ROUNDS):
+    for _ in range(WORD_ROUNDS):
         nearest = _nearest(sample, words)
         for word in np.unique(nearest):
             words[word] = sample[nearest == word].mean(axis=0)
@@ -225,13 +221,28 @@ def _verification_options(job: MappingJob) -> pycolmap.TwoViewGeometryOptions:
     return options
 
 
-def count_matches(job: MappingJob) -> Result:
+def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
+    """Returns the verified matches of all pairs in a database; the names of a pair in order."""
+    verified = {}
+    with pycolmap.Database.open(path) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            first, second = (names[i] for i in pycolmap.pair_id_to_image_pair(number))
+            if first > second:
+                first, second = second, first
+                geometry.invert()
+            if len(geometry.inlier_matches) >= MIN_PAIR_INLIERS:
+                verified[first, second] = geometry
+    return verified
+
+
+def count_matches(job: MappingJob) -> MatchesResult:
     """Returns the numbers of matched pairs, verified pairs and verified matches."""
     groups = database.count_inliers(job.database)
-    return {
-        "rows": database.progress(job.database, "matches"),
-        "verified_pairs": sum(pairs for pairs, _, _ in groups),
-        "matches": sum(matches for _, matches, _ in groups)}
+    return MatchesResult(
+        rows=database.progress(job.database, "matches"),
+        verified_pairs=sum(pairs for pairs, _, _ in groups),
+        matches=sum(matches for _, matches, _ in groups))
 
 
 def check_motion(job: MappingJob) -> None:
@@ -243,6 +254,6 @@ def check_motion(job: MappingJob) -> None:
     """
     groups = database.count_inliers(job.database)
     everything = tuple(map(sum, zip(*groups, strict=True))) or (0, 0, 0)
-    deep = [counts for counts in groups if counts[1] - counts[2] >= MIN_SHARE * everything[1]]
+    deep = [counts for counts in groups if counts[1] - counts[2] >= MIN_DEEP_SHARE * everything[1]]
     deepest = min(deep, key=lambda counts: counts[2] / counts[1], default=everything)
     checks.check_motion(*deepest)

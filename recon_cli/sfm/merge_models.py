@@ -1,8 +1,6 @@
 """One model from all that a mapper found: parts merged, wrong images taken out.
 
-Two models of one capture hold the same keypoints: in images that are in both, and in verified pairs
-of images, one of each. Where both have a point for such a keypoint, the two points are one, and the
-similarity between the models follows from many of them.
+Two models of one capture are brought together by the points that both have; see `shared_points`.
 """
 
 from __future__ import annotations
@@ -12,23 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm import mapper, verdict
-from recon_cli.sfm.checks import MIN_FRAMES
+from recon_cli.scene.similarity import Similarity
+from recon_cli.sfm import mapper, matching, verdict
 from recon_cli.sfm.job import MappingJob
+from recon_cli.sfm.limits import MAX_POINT_ERROR, MAX_REJECTED, MIN_FRAMES, MIN_POSE_SHARE
+from recon_cli.sfm.shared_points import (
+    describe_segment,
+    estimate_similarity,
+    find_shared_points,
+    to_sim3d,
+)
 from recon_cli.sfm.verdict import ModelVerdict
-
-# COLMAP's thresholds for the pose of an image (abs_pose_min_num_inliers, _min_inlier_ratio).
-MIN_INLIERS = 30
-MIN_INLIER_SHARE = 0.25
-# Distance of two equal points, as a share of the median distance of a point from a camera. Depth is
-# known to 1 to 3%: up to 4 px of some 1000 px focal length over 7 to 23 degrees between rays.
-MAX_ERROR = 0.03
-MAX_TRIALS = 10_000
-# With a larger share of suspected images the model is wrong; removing them would hide it.
-MAX_REJECTED = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,62 +106,36 @@ def merge(
     new = set(mapper.list_registered(other)) - set(mapper.list_registered(base))
     if len(new) < MIN_FRAMES:
         return None
-    motion = similarity(*find_shared_points(job.database, other, base), base, seed=job.seed)
+    motion = find_similarity(job, other, base)
     if motion is None:
         return None
+    moved = to_sim3d(motion)
     poses = {image.name: image.cam_from_world() for image in _images(base)}
     for image in _images(other):
         if image.name in new:
-            poses[image.name] = motion.transform_camera_world(image.cam_from_world())
+            poses[image.name] = moved.transform_camera_world(image.cam_from_world())
     joined = mapper.triangulate(job, build_posed_model(job.database, base, poses))
     mapper.adjust(joined)
     return mapper.extend_model(job, joined)
 
 
-def similarity(
-    source: NDArray[np.float64],  # [P, 3]
-    target: NDArray[np.float64],  # [P, 3]
-    base: pycolmap.Reconstruction,
-    *,
-    seed: int,
-) -> pycolmap.Sim3d | None:
-    """Returns the similarity from points to those of `base`, None where too few agree."""
-    if len(source) < MIN_INLIERS:
+def find_similarity(
+    job: MappingJob, source: pycolmap.Reconstruction, target: pycolmap.Reconstruction
+) -> Similarity | None:
+    """Returns the similarity between two models of one database; None where too few points agree.
+    """
+    both = [describe_segment(index, model) for index, model in enumerate((source, target))]
+    found = find_shared_points(both, matching.read_verified(job.database))
+    if not found:
         return None
-    points = np.array([point.xyz for point in base.points3D.values()])
-    centers = np.array([image.projection_center() for image in _images(base)])
-    depths = np.linalg.norm(points - np.median(centers, axis=0), axis=1)
-    options = pycolmap.RANSACOptions()
-    options.max_error = MAX_ERROR * float(np.median(depths))
-    options.max_num_trials = MAX_TRIALS
-    options.random_seed = seed
-    estimate = pycolmap.estimate_sim3d_robust(source, target, options)
-    enough = max(MIN_INLIERS, MIN_INLIER_SHARE * len(source))
-    if estimate is None or estimate["num_inliers"] < enough:
-        return None
-    motion: pycolmap.Sim3d = estimate["tgt_from_src"]
-    return motion
-
-
-def find_shared_points(
-    database: Path, source: pycolmap.Reconstruction, target: pycolmap.Reconstruction
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # [P, 3], [P, 3]
-    """Returns the points that the same or matching keypoints show, in both models."""
-    ours, theirs = _points_of_keypoints(source), _points_of_keypoints(target)
-    same = {
-        (ours[name][row], theirs[name][row])
-        for name in ours.keys() & theirs.keys() for row in ours[name].keys() & theirs[name].keys()}
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        geometries = zip(*opened.read_two_view_geometries(), strict=True)
-        for pair, geometry in geometries:
-            first, second = (names[image] for image in pycolmap.pair_id_to_image_pair(pair))
-            rows = geometry.inlier_matches
-            same |= _pair_points(ours.get(first, {}), theirs.get(second, {}), rows)
-            same |= _pair_points(ours.get(second, {}), theirs.get(first, {}), rows[:, ::-1])
-    ordered = sorted(same)
-    return (np.array([source.point3D(point).xyz for point, _ in ordered]).reshape(-1, 3),
-            np.array([target.point3D(point).xyz for _, point in ordered]).reshape(-1, 3))
+    # Each two points once, however many images show them.
+    points = np.unique(np.column_stack([found[0].ours, found[0].theirs]), axis=0)
+    places = np.array([point.xyz for point in target.points3D.values()])
+    depths = np.linalg.norm(places - np.median(both[1].cameras.centers, axis=0), axis=1)
+    agreed = estimate_similarity(
+        points[:, :3], points[:, 3:], max_error=MAX_POINT_ERROR * float(np.median(depths)),
+        min_share=MIN_POSE_SHARE, seed=job.seed)
+    return None if agreed is None else agreed.motion
 
 
 def build_posed_model(
@@ -196,20 +164,3 @@ def build_posed_model(
 
 def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [model.image(i) for i in sorted(model.reg_image_ids())]
-
-
-def _points_of_keypoints(model: pycolmap.Reconstruction) -> dict[str, dict[int, int]]:
-    """Returns the point that each keypoint shows, by name of image and index of the keypoint."""
-    return {
-        image.name: {row: point.point3D_id for row, point in enumerate(image.points2D)
-                     if point.has_point3D()}
-        for image in _images(model)}
-
-
-def _pair_points(
-    ours: Mapping[int, int], theirs: Mapping[int, int], rows: NDArray[np.uint32]
-) -> set[tuple[int, int]]:
-    """Returns the points that matches [M, 2] between two images make one."""
-    return {
-        (ours[row], theirs[other]) for row, other in rows.tolist()
-        if row in ours and other in theirs}

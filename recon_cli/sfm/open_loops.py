@@ -1,7 +1,7 @@
 """Loops of a walk that a model leaves open: two stretches show one place, and the model has two.
 
 Where a walk comes back, frames far apart in time match. If the cameras have drifted, these matches
-contradict the model, and the mapper drops them: it stays wrong though it was told. Such matches
+contradict the model, and the mapper drops them, so that it stays wrong. Such matches
 agree with each other on one motion, which brings the two copies of the place together. Places that
 only look alike give such a motion as well, but it is larger than what a way drifts.
 """
@@ -14,22 +14,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.evidence import MatchEvidence
+from recon_cli.sfm.limits import (
+    MAX_DRIFT,
+    MAX_DRIFT_DEG,
+    MAX_POINT_ERROR,
+    MIN_LOOP_SHARE,
+    NEAR_IN_WALK,
+)
+from recon_cli.sfm.shared_points import estimate_similarity
+from recon_cli.workspace.json_record import JsonRecord
 
-NEAR = 10  # images; pairs whose ends are nearer than this in the walk belong to one loop
-# Points that agree on one motion, and their share of all that the pairs show in two copies.
-MIN_POINTS, MIN_SHARE = 30, 0.5
 # Share of the points that are in one place already above which the loop is closed.
 CLOSED = 0.2
-MAX_ERROR = 0.03  # between equal points, as a share of the usual depth; see `merge_models`
-MAX_TRIALS = 2000
-# What a way may drift; see `pair_checks`.
-MAX_DRIFT_DEG, MAX_DRIFT = 15.0, 0.2
 
 
 @dataclass(frozen=True)
-class OpenLoop:
+class OpenLoop(JsonRecord):
     """Two stretches of a walk that show the same place, which the model has twice."""
 
     first: str  # an image of the earlier stretch
@@ -63,7 +64,7 @@ def _groups(evidence: MatchEvidence, place: NDArray[np.int64]) -> Iterator[list[
     left = sorted(evidence.doubled, key=lambda row: (-int(evidence.matches[row]), row))
     while left:
         ends = np.sort(place[evidence.pairs[left]], axis=1)
-        near = (np.abs(ends - ends[0]) <= NEAR).all(axis=1)
+        near = (np.abs(ends - ends[0]) <= NEAR_IN_WALK).all(axis=1)
         group = [row for row, close in zip(left, near, strict=True) if close]
         left = [row for row, close in zip(left, near, strict=True) if not close]
         firsts, seconds = ends[near].T
@@ -78,29 +79,23 @@ def _judge(
     """Returns the loop that some pairs leave open; None if they agree on nothing, or it is closed.
     """
     later, earlier = _shown_points(evidence, place, rows)
-    if len(later) < MIN_POINTS:
-        return None
     first, second = sorted(evidence.pairs[rows[0]], key=lambda image: place[image])
-    depth = float(evidence.depths[first])
-    options = pycolmap.RANSACOptions()
-    options.max_error = MAX_ERROR * depth
-    options.max_num_trials = MAX_TRIALS
-    options.random_seed = seed
-    found = pycolmap.estimate_sim3d_robust(later, earlier, options)
-    if found is None or found["num_inliers"] < max(MIN_POINTS, MIN_SHARE * len(later)):
+    max_error = MAX_POINT_ERROR * float(evidence.depths[first])
+    agreed = estimate_similarity(
+        later, earlier, max_error=max_error, min_share=MIN_LOOP_SHARE, seed=seed)
+    if agreed is None:
         return None
     apart = np.linalg.norm(later - earlier, axis=1)
-    if np.count_nonzero(apart <= options.max_error) > CLOSED * found["num_inliers"]:
+    if np.count_nonzero(apart <= max_error) > CLOSED * len(agreed.rows):
         return None
-    motion = found["tgt_from_src"]
-    turn = float(np.degrees(motion.rotation.angle()))
+    turn = agreed.turn_deg
     path = evidence.centers[order[place[first]:place[second] + 1]]
     way = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     shift = float(np.median(apart)) / max(way, 1e-12)
     if turn > MAX_DRIFT_DEG or shift > MAX_DRIFT:
         return None
     return OpenLoop(evidence.names[first], evidence.names[second], len(rows),
-                    int(found["num_inliers"]), float(motion.scale), turn, shift)
+                    len(agreed.rows), agreed.motion.scale, turn, shift)
 
 
 def _shown_points(

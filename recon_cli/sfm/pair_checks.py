@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.evidence import (
-    MAX_ERROR,
     explained_matches,
     inverse_depths,
     lift_rays,
     nearest_depth,
     seen_depths,
 )
-from recon_cli.sfm.matching import MAX_TRIALS, Pair
+from recon_cli.sfm.limits import (
+    MAX_DRIFT,
+    MAX_DRIFT_DEG,
+    MAX_ERROR_PX,
+    MAX_TRIALS,
+    MIN_PAIR_EXPLAINED,
+)
+from recon_cli.sfm.matching import Pair
 
-# Share of a pair's matches that the cameras of the skeleton must explain, within MAX_ERROR.
-MIN_AGREEING = 0.5
-# A pair whose own rotation is this close to the skeleton's may show its drift. Around a can whose
-# label repeats the pairs to leave out are off by 116 degrees in the median.
-MAX_DRIFT_DEG = 15.0
-MAX_DRIFT = 0.2  # displacement as a share of the way between the two frames
-NEAR = 3  # frames; a loop is closed by more than one pair of near frames
+NEAR_FRAMES = 3  # frames; a loop is closed by more than one pair of near frames
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ def check_pairs(
         ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
                         for side, name in enumerate(pair))
         explained = explained_matches(
-            first.image, ours, second.image, theirs, first.near, MAX_ERROR)
-        if explained.mean() >= MIN_AGREEING:
+            first.image, ours, second.image, theirs, first.near, MAX_ERROR_PX)
+        if explained.mean() >= MIN_PAIR_EXPLAINED:
             agreeing.add(pair)
         elif _is_drift(first, ours, second, theirs):
             drifted.add(pair)
@@ -151,4 +151,4 @@ def _supported(drifted: Collection[Pair], agreeing: Collection[Pair]) -> set[Pai
     places = np.array([[row[name] for name in pair] for pair in drifted]).reshape(-1, 2)
     return {
         pair for pair, place in zip(drifted, places, strict=True)
-        if np.count_nonzero(np.abs(places - place).max(axis=1) <= NEAR) > 1}
+        if np.count_nonzero(np.abs(places - place).max(axis=1) <= NEAR_FRAMES) > 1}

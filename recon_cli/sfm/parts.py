@@ -11,6 +11,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from recon_cli.errors import ConfigError, ManifestError
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import mapper
@@ -19,16 +21,14 @@ from recon_cli.sfm.job import (
     LOG_FILE,
     VERDICT,
     MappingJob,
-    Result,
     StepLog,
     fresh_folder,
     publish,
 )
+from recon_cli.sfm.results import EarlierRun, ModelResult, PartResult
 from recon_cli.sfm.verdict import ModelVerdict
 from recon_cli.workspace import atomic, layout
 from recon_cli.workspace.summaries import SfmSummary
-
-FINISHED = "finished"  # in the result of the step `model`: facts of the run that found the parts
 
 
 def write_parts(
@@ -47,8 +47,8 @@ def write_parts(
 def describe_part(
     model: pycolmap.Reconstruction, verdict: ModelVerdict | None, *,
     held: Collection[str] = (), rejected: Mapping[str, str] | None = None,
-) -> Result:
-    """Returns what the summary of the stage says of a part where that is taken.
+) -> PartResult:
+    """Returns the figures and sentences of a part.
 
     Frames that are `held` by any part are not said to have no camera.
     """
@@ -56,15 +56,22 @@ def describe_part(
     if verdict is not None:
         lost = {name: why for name, why in verdict.unregistered.items() if name not in held}
         lines = dataclasses.replace(verdict, unregistered=lost).lines()
-    return {**mapper.describe_model(model), "rejected": dict(rejected or {}),
-            "verdict": verdict.to_json() if verdict else None, "lines": lines}
+    tracks = model.compute_num_observations() > 0
+    return PartResult(
+        registered=tuple(mapper.list_registered(model)), points=model.num_points3D(),
+        mean_track_length=model.compute_mean_track_length() if tracks else None,
+        reprojection_error_px=model.compute_mean_reprojection_error() if tracks else None,
+        median_triangulation_angle_deg=(
+            float(np.median(mapper.triangulation_angles(model))) if tracks else None),
+        rejected=dict(rejected or {}), verdict=verdict.to_json() if verdict else None,
+        lines=tuple(lines))
 
 
 def check_part(job: MappingJob) -> None:
     """Raises ConfigError where the capture has no part of the job's number."""
-    found = StepLog(job.out).result("model")
+    found = StepLog(job.out).result("model", ModelResult)
     assert found is not None, "the parts are found before one of them is placed"
-    sizes = [len(part["registered"]) for part in found["parts"]]
+    sizes = [len(part.registered) for part in found.parts]
     if job.part <= len(sizes):
         return
     named = ", ".join(f"{number} of {size} frames" for number, size in enumerate(sizes, 1))
@@ -85,18 +92,19 @@ def take_over(
         known = SfmSummary.from_json(summary)
     except ManifestError:  # of another version
         return False
-    log = StepLog(finished)
+    log, current = StepLog(finished), StepLog(out).result("model", ModelResult)
+    found = log.result("model", ModelResult)
     needed = log.files("model")
     intact = set(touched).isdisjoint((*needed, LOG_FILE))
-    if not (known.parts and intact) or log.result("model") is None:
+    if found is None or not (known.parts and intact):
         return False
-    if FINISHED in (StepLog(out).result("model") or {}):  # of an interrupted run
+    if current is not None and current.earlier is not None:  # of an interrupted run
         return True
     for path in out.iterdir():
         layout.remove(path)
     for name in (*needed, DATABASE):
         if (finished / name).is_file():
             layout.link_or_copy(finished / name, out / name)
-    log.hand_on(out, "model", {FINISHED: {
-        "segments": known.segments, "cpu_seconds": known.cpu_seconds or {}}})
+    log.copy_to(out, "model", dataclasses.replace(found, earlier=EarlierRun(
+        segments=known.segments, cpu_seconds=known.cpu_seconds or {})))
     return True

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from recon_cli.errors import ExitCode, ReconError, SfmError
+from recon_cli.errors import ExitCode, ReconError, SfmError, format_count
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
@@ -33,7 +33,7 @@ _DOING = {
     "mapping": ("placing cameras", "frame"),
     "joining": ("joining segments", "segment"),
     "undistorted": ("undistorting frames", "frame")}
-# The step that a phase belongs to, where the names differ.
+# The step of a phase, where the names differ.
 _STEP = {"skeleton": "features", "coarse": "matches", "first": "matches", "mapping": "model",
          "joining": "model"}
 LOG = "log.txt"
@@ -72,7 +72,7 @@ class Monitor:
         if self._phase is None:
             return "starting"
         text, unit = _DOING[self._phase.name]
-        return f"{text} ({self._count} of {self._phase.total} {unit}s done)"
+        return f"{text} ({self._count} of {format_count(self._phase.total, unit)} done)"
 
     def show(self, event: Phase | int) -> None:
         """Shows that a phase begins, or how many units of it are done."""
@@ -109,7 +109,7 @@ class Monitor:
 
 
 class CrashError(SfmError):
-    """The mapping process died of what is no fault of the capture."""
+    """The mapping process crashed for reasons unrelated to the capture."""
 
 
 def run_job(
@@ -118,7 +118,7 @@ def run_job(
 ) -> None:
     """Runs a job in a process of its own; its results are in the step log. See also `Monitor`.
 
-    SfmError if there is no model to trust or the time is up; CrashError if the process died;
+    SfmError if no model can be trusted or the time is up; CrashError if the process crashed;
     FormatError if a frame cannot be read; WorkspaceError if another process works in the folder;
     OSError as met in the process: the disk is full or not writable.
     """
@@ -213,7 +213,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
             "The system may have run out of memory; try --max-features 1024 or fewer frames "
             "(`recon ingest --frames N`).")
     return CrashError(
-        f"The mapping process {how} while it was {monitor.doing}. Its log {log} ends with: "
+        f"The mapping process {how} while it was {monitor.doing}. The last error in {log}: "
         f"{last_error(log)}", hint=hint)
 
 

@@ -1,4 +1,4 @@
-"""How well the scale of one stretch of a walk is known against that of the next.
+"""How well the scale of one stretch of a walk is known relative to the next.
 
 A camera that turns in a narrow place ties what lies before it to what comes after by points that
 show little of either scale. Matches agree then, whatever the scale is: a walk of 30 m was trusted
@@ -20,24 +20,25 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.floor_heights import SPREAD, compare_heights, measure_heights
+from recon_cli.sfm.limits import LOSS_SCALE
+from recon_cli.workspace.json_record import JsonRecord
 
 # The scale of a stretch is that of its cameras' centres. It spans this share of the extent of all
 # and of the usual depth, and so many cameras: on a shorter one the camera stands still, or turns.
-REACH, DEPTHS, LEAST = 0.2, 0.5, 10
+LEAST_EXTENT, LEAST_DEPTHS, LEAST_CAMERAS = 0.2, 0.5, 10
 # Errors of tracks and of the lens are shared by many observations and do not average out: scales
 # were off by up to 20 times what independent errors would leave on a walk with a cheap lens, and by
 # about as much as that in rendered rooms.
 SHARED_ERRORS = 10.0
-MAX_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_scale_breaks.py`
-DOUBTFUL = MAX_ERROR / 3  # the floor is looked at from here on
-LOSS_SCALE = 0.5  # of Cauchy's loss, times the mean error, as in `mapper.sharpen`
-_RIDGE = 1e-10  # times the diagonal: position, turn and scale of the whole are free
+MAX_SCALE_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_scale_breaks.py`
+DOUBTFUL = MAX_SCALE_ERROR / 3  # the floor is looked at from here on
+_RIDGE = 1e-10  # times the diagonal: position, turn and scale of the model are free
 _POSE = 6  # unknowns of a camera: its turn, and its centre
 
 
 @dataclass(frozen=True)
-class ScaleCut:
-    """Where the relative scale of what lies before and after is known least."""
+class ScaleCut(JsonRecord):
+    """Where the relative scale of the two parts of a walk is known least."""
 
     error: float  # of the relative scale, as a share; one standard deviation
     before: str  # the last image before the cut
@@ -54,7 +55,7 @@ def find_weakest_scale(
     `order` are names of images with a camera as they were taken; `between` limits the cuts to those
     between two of them. None where no stretch before a cut and none behind it is long enough.
     """
-    if len(order) < 2 * LEAST:
+    if len(order) < 2 * LEAST_CAMERAS:
         return None
     information = _Information(model, order)
     first, last = (0, len(order)) if between is None else sorted(map(list(order).index, between))
@@ -74,8 +75,8 @@ def find_weakest_scale(
 
 
 def is_scale_known(cut: ScaleCut | None) -> bool:
-    """Returns whether no relative scale is less certain than MAX_ERROR."""
-    return cut is None or cut.error <= MAX_ERROR
+    """Returns whether no relative scale is less certain than MAX_SCALE_ERROR."""
+    return cut is None or cut.error <= MAX_SCALE_ERROR
 
 
 def _ask_floor(error: float, step: float | None) -> float:
@@ -104,13 +105,13 @@ def _stretches(
 def _count_until(centers: NDArray[np.float64], need: float) -> int | None:
     """Returns how many of the cameras [F, 3], from the first on, span a box of a diagonal `need`.
 
-    None where all of them span less, or they are fewer than LEAST.
+    None where all of them span less, or they are fewer than LEAST_CAMERAS.
     """
     low, high = np.minimum.accumulate(centers), np.maximum.accumulate(centers)
     wide = np.flatnonzero(np.linalg.norm(high - low, axis=1) >= need)
-    if not len(wide) or len(centers) < LEAST:
+    if not len(wide) or len(centers) < LEAST_CAMERAS:
         return None
-    return max(int(wide[0]) + 1, LEAST)
+    return max(int(wide[0]) + 1, LEAST_CAMERAS)
 
 
 class _Information:
@@ -120,7 +121,8 @@ class _Information:
         seen = _Observations(model, order)
         self.centers = seen.centers
         self.reach = max(  # of a stretch, the diagonal of the box around its cameras
-            REACH * float(np.linalg.norm(np.ptp(seen.centers, axis=0))), DEPTHS * seen.depth)
+            LEAST_EXTENT * float(np.linalg.norm(np.ptp(seen.centers, axis=0))),
+            LEAST_DEPTHS * seen.depth)
         self._factor, self._variance = _factorise(seen)
 
     def error(self, before: NDArray[np.int64], behind: NDArray[np.int64]) -> float:

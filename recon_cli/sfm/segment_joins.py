@@ -1,4 +1,4 @@
-"""Whether and how two segments belong together, and where all of them lie then.
+"""Which segments belong together, and how all of them lie to each other.
 
 A join is a similarity from points that both segments have: those of the frames in common, and those
 that verified pairs of their other frames match. It is made where two witnesses support it and none
@@ -17,67 +17,31 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 from scipy.spatial.transform import Rotation
 
-from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.similarity import Similarity
+from recon_cli.sfm.limits import (
+    MAX_DRIFT,
+    MAX_DRIFT_DEG,
+    MAX_POINT_ERROR,
+    MAX_TENSION,
+    MIN_COMMON_SHARE,
+    MIN_LOOP_SHARE,
+    MIN_PAIR_INLIERS,
+    MIN_POSE_INLIERS,
+    NEAR_IN_WALK,
+)
+from recon_cli.sfm.matching import Pair
+from recon_cli.sfm.shared_points import SegmentCameras, SharedPoints, estimate_similarity
 
-Pair = tuple[str, str]
-
-# Distance of two equal points, as a share of the median distance of a point from a camera, and how
-# many must be equal; see `merge_models`.
-MAX_ERROR, MIN_INLIERS = 0.03, 30
-MAX_TRIALS = 2000
 MOST_POINTS = 4000  # of two segments that a similarity is found from
-# Of the points of common frames, and of a pair of other frames, that must agree. Where a segment is
-# broken within the common frames, half to three quarters of their points agree, else nine tenths:
-# see tests/bench/bench_join_breaks.py.
-MIN_COMMON_SHARE, MIN_SHARE = 0.8, 0.5
-MIN_MATCHES = 15  # of a pair of frames that counts; COLMAP verifies pairs from so many on
 # Nine of ten cameras of common frames: of the extent of the smaller segment, and degrees. A median
 # would not see that the others are off.
 CAMERAS, MAX_OFF, MAX_TURN_DEG = 0.9, 0.05, 3.0
-NEAR = 10  # frames; pairs that are nearer to each other in both segments are one witness
-# A loop may be off by what a way drifts; see `pair_checks`. Of the way's extent.
-MAX_DRIFT, MAX_DRIFT_DEG = 0.2, 15.0
 SAMPLED = 60  # points of a join in the common adjustment
-# Times MAX_ERROR: what the points of a join may be apart, in the median, once loops pull at it.
-MAX_TENSION = 3.0
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentCameras:
-    """The cameras of one segment in its own frame, F of them."""
-
-    names: tuple[str, ...]  # in the order of the walk
-    centers: NDArray[np.float64]  # [F, 3]
-    rotations: NDArray[np.float64]  # [F, 3, 3], world to camera
-    depth: float  # median distance of a point from a camera that sees it
-
-    @property
-    def extent(self) -> float:
-        """The diagonal of the box around the cameras."""
-        return float(np.linalg.norm(np.ptp(self.centers, axis=0)))
-
-
-@dataclass(frozen=True, eq=False)
-class SharedPoints:
-    """M points that two segments have in common, each in the frame of either."""
-
-    first: int  # segments by index, first < second
-    second: int
-    ours: NDArray[np.float64]  # [M, 3]
-    theirs: NDArray[np.float64]  # [M, 3]
-    pair: NDArray[np.int64]  # [M], index into pairs
-    pairs: tuple[Pair, ...]  # frames that show them; twice the same name for a frame in common
-
-    @property
-    def common(self) -> NDArray[np.bool_]:  # [M]
-        """Which of them a frame in common shows."""
-        return np.array([a == b for a, b in self.pairs], np.bool_)[self.pair]
 
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """What two segments say of each other."""
+    """How two segments lie to each other, and the evidence for and against it."""
 
     first: int
     second: int
@@ -102,7 +66,7 @@ class Join:
 def judge_join(
     shared: SharedPoints, first: SegmentCameras, second: SegmentCameras, *, seed: int
 ) -> Join:
-    """Returns what the points and cameras of two segments say of a join."""
+    """Returns the join of two segments that their points and cameras support or contradict."""
     common = shared.common
     has_frames = bool(set(first.names) & set(second.names))
     motion = _similarity(shared, common, second.depth, seed)
@@ -112,13 +76,13 @@ def judge_join(
         return Join(shared.first, shared.second, None, (), why, np.zeros((0, 3)),
                     np.zeros((0, 3)), has_frames)
     off = np.linalg.norm(motion.points(shared.ours) - shared.theirs, axis=1)
-    agree = off <= MAX_ERROR * second.depth
+    agree = off <= MAX_POINT_ERROR * second.depth
     support: list[str] = []
     against: list[str] = []
     if has_frames:
         share = float(agree[common].mean()) if common.any() else 0.0
         text = f"{share:.0%} of {np.count_nonzero(common)} points of common frames agree"
-        enough = share >= MIN_COMMON_SHARE and np.count_nonzero(agree & common) >= MIN_INLIERS
+        enough = share >= MIN_COMMON_SHARE and np.count_nonzero(agree & common) >= MIN_POSE_INLIERS
         (support if enough else against).append(text)
         shift, turn = camera_residuals(motion, first, second)
         text = (f"{CAMERAS:.0%} of their common cameras are at most {shift:.1%} of the extent and "
@@ -140,19 +104,11 @@ def _similarity(
 
     Points of common frames decide where there are enough: others may only look alike.
     """
-    rows = np.flatnonzero(common if np.count_nonzero(common) >= MIN_INLIERS else common | True)
-    if len(rows) < MIN_INLIERS:
-        return None
+    rows = np.flatnonzero(common if np.count_nonzero(common) >= MIN_POSE_INLIERS else common | True)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int)]
-    options = pycolmap.RANSACOptions()
-    options.max_error = MAX_ERROR * depth
-    options.max_num_trials = MAX_TRIALS
-    options.random_seed = seed
-    estimate = pycolmap.estimate_sim3d_robust(shared.ours[rows], shared.theirs[rows], options)
-    if estimate is None or estimate["num_inliers"] < MIN_INLIERS:
-        return None
-    found = estimate["tgt_from_src"]
-    return Similarity(float(found.scale), found.rotation.matrix(), np.asarray(found.translation))
+    agreed = estimate_similarity(
+        shared.ours[rows], shared.theirs[rows], max_error=MAX_POINT_ERROR * depth, seed=seed)
+    return None if agreed is None else agreed.motion
 
 
 def camera_residuals(
@@ -180,7 +136,7 @@ def _agreeing_pairs(shared: SharedPoints, agree: NDArray[np.bool_]) -> list[Pair
     counts = np.bincount(shared.pair, minlength=len(shared.pairs))
     good = np.bincount(shared.pair[agree], minlength=len(shared.pairs))
     return [pair for pair, count, fine in zip(shared.pairs, counts, good, strict=True)
-            if pair[0] != pair[1] and count >= MIN_MATCHES and fine >= MIN_SHARE * count]
+            if pair[0] != pair[1] and count >= MIN_PAIR_INLIERS and fine >= MIN_LOOP_SHARE * count]
 
 
 def _stretches(
@@ -194,7 +150,7 @@ def _stretches(
     left = list(pairs)
     while left:
         places = np.array([[rows[side][pair[side]] for side in (0, 1)] for pair in left])
-        near = (np.abs(places - places[0]) <= NEAR).all(axis=1)
+        near = (np.abs(places - places[0]) <= NEAR_IN_WALK).all(axis=1)
         group = [pair for pair, close in zip(left, near, strict=True) if close]
         left = [pair for pair, close in zip(left, near, strict=True) if not close]
         if len(group) >= 2:
@@ -236,7 +192,7 @@ def place_segments(
         inner = [join for join in order if join.first in members]
         near = [join for join in inner if join in tree or _is_near(join, start, cameras)]
         motions, kept = (start, near) if bending else _close_loops(start, near, tree, cameras)
-        refused = [*(f"the loop between segments {join.first} and {join.second} contradicts the way"
+        refused = [*(f"the loop of segments {join.first} and {join.second} contradicts the walk"
                      for join in inner if join not in kept), *(
             f"segments {join.first} and {join.second} are not joined: " + "; ".join(
                 join.contradictions or ("fewer than two witnesses support it",))
@@ -305,7 +261,7 @@ def _unit(
     join: Join, motions: Mapping[int, Similarity], cameras: Mapping[int, SegmentCameras]
 ) -> float:
     """Returns how far apart equal points of a join may be, in the common frame."""
-    return MAX_ERROR * motions[join.second].scale * cameras[join.second].depth
+    return MAX_POINT_ERROR * motions[join.second].scale * cameras[join.second].depth
 
 
 def adjust_motions(

@@ -12,6 +12,7 @@ import itertools
 import math
 import shutil
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,16 +33,17 @@ from recon_cli.progress import NullProgress, Progress
 from recon_cli.sfm.job import SPLIT, MappingJob, StepLog
 from recon_cli.sfm.keyframes import choose_keyframes
 from recon_cli.sfm.process import CrashError, run_job
+from recon_cli.sfm.results import SplitResult, StepResult
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.layout import disk_errors
 
 Names = tuple[str, ...]
 
-MOST_WHOLE = 200  # frames up to which a capture is mapped as one
+MOST_UNSPLIT = 200  # frames up to which a capture is mapped as one
 # Frames of a segment, and those that it has in common with the next one. Shorter segments spend
 # more on what they share, longer ones are fewer jobs.
-LENGTH, OVERLAP = 150, 25
-LEAST = 10  # frames of a segment
+LENGTH, SEGMENT_OVERLAP = 150, 25
+LEAST_FRAMES = 10  # frames of a segment
 TRIES = 2  # of a mapping process that is killed, perhaps for want of memory beside others
 COMMAND = "map-segment"  # of recon, which takes JOB
 # in the folder of a segment: what to do, how much of it is done, and what the command printed
@@ -55,18 +57,19 @@ Start = Callable[[int], tuple[Executor, int]]
 
 
 def count_segments(frames: int, asked: str) -> int:
-    """Returns how many segments so many frames are mapped in; 1: they stay whole.
+    """Returns how many segments so many frames are mapped in; 1: they are mapped as one.
 
     `asked` is auto, off or a number; ConfigError if it is more than the frames allow.
     """
     if asked == "off":
         return 1
     if asked == "auto":
-        return 1 if frames <= MOST_WHOLE else -(-(frames - OVERLAP) // (LENGTH - OVERLAP))
-    most = max(1, frames // LEAST)
+        step = LENGTH - SEGMENT_OVERLAP
+        return 1 if frames <= MOST_UNSPLIT else -(-(frames - SEGMENT_OVERLAP) // step)
+    most = max(1, frames // LEAST_FRAMES)
     if int(asked) > most:
         raise ConfigError(
-            f"{frames} frames are too few for {asked} segments: each takes {LEAST} or more.",
+            f"{frames} frames are too few for {asked} segments of at least {LEAST_FRAMES} frames.",
             hint=f"Give at most --segments {most}.")
     return int(asked)
 
@@ -80,8 +83,8 @@ def count_mapped(job: MappingJob) -> int:
 
 
 def overlap(frames: int, count: int) -> int:
-    """Returns how many frames two segments in a row have in common: OVERLAP, or fewer of few."""
-    return min(OVERLAP, frames // (2 * count))
+    """Returns how many frames two segments in a row have in common: fewer of few frames."""
+    return min(SEGMENT_OVERLAP, frames // (2 * count))
 
 
 def split_by_time(names: Sequence[str], count: int) -> tuple[Names, ...]:
@@ -96,7 +99,7 @@ def split_by_time(names: Sequence[str], count: int) -> tuple[Names, ...]:
 class SegmentRuns:
     """What became of the segments of a job."""
 
-    job: MappingJob  # of the whole, which joins them
+    job: MappingJob  # of the capture, which joins them
     failed: Mapping[int, str]  # why some have no model, by index
     cpu_seconds: Mapping[str, float]  # that each step took, in all segments together
 
@@ -117,9 +120,9 @@ def map_segments(
         job = dataclasses.replace(job, split=count)
         run_job(dataclasses.replace(job, last=SPLIT), progress=progress, record=record,
                 on_idle=lambda: None)
-        split = StepLog(job.out).result(SPLIT)
+        split = StepLog(job.out).result(SPLIT, SplitResult)
         assert split is not None, "the mapping process ended without a split"
-        parts = tuple(map(tuple, split["segments"]))
+        parts = split.segments
     job = dataclasses.replace(job, segments=parts)
     executor, threads = start(len(parts))
     try:
@@ -130,10 +133,10 @@ def map_segments(
     if len(failed) == len(parts):
         raise SfmError(f"None of the {len(parts)} segments could be mapped: {failed[0]}",
                        hint="Try --segments off, more frames, or a slower walk.")
-    steps = [(step, StepLog(each.out).result(step)) for each in jobs for step in each.steps]
-    cpu = dict.fromkeys((step for step, _ in steps), 0.0)
-    for step, result in steps:
-        cpu[step] += float((result or {}).get("cpu_seconds", 0.0))
+    cpu: dict[str, float] = defaultdict(float)
+    for each, step in itertools.product(jobs, jobs[0].steps):
+        result = StepLog(each.out).result(step, StepResult)
+        cpu[step] += result.cpu_seconds if result else 0.0
     left = (deadline - time.monotonic()) / 60
     if left <= 0:
         raise SfmError(f"The segments were not mapped within {job.max_minutes:g} minutes.",
@@ -185,7 +188,7 @@ def _run_all(
         def prepare() -> str:
             left = (deadline - time.monotonic()) / 60
             if left <= 0:
-                return "there was no time left for it"
+                return "no time was left for it"
             dataclasses.replace(job, max_minutes=left).write(file)
             return ""
 
@@ -193,10 +196,11 @@ def _run_all(
         return SharedJob(f"segment {index}", command, look, len(job.names), prepare)
 
     def refuse(shared: SharedJob, end: JobEnd) -> None:
-        if 0 < end.code < ExitCode.SIGNAL and end.code != SfmError.exit_code:  # no fault of its own
+        # Not a failure of the capture, but of the machine.
+        if 0 < end.code < ExitCode.SIGNAL and end.code != SfmError.exit_code:
             raise _ERRORS.get(end.code, SfmError)(
                 f"{shared.name.capitalize()} could not be mapped: {end.reason}",
-                hint=f"Finished segments are kept. What was printed is in {shared.command.log}.")
+                hint=f"Finished segments are kept. Its output is in {shared.command.log}.")
 
     ends = run_jobs(
         [shared(index) for index in range(len(jobs))], executor, progress, report=refuse,
@@ -206,7 +210,7 @@ def _run_all(
 
 def _share(job: MappingJob) -> float:
     """Returns how much of a segment is done."""
-    if StepLog(job.out).result(job.last) is not None:
+    if StepLog(job.out).is_finished(job.last):
         return 1.0
     try:
         done, total = read_json(job.out / PROGRESS, list)

@@ -1,4 +1,4 @@
-"""Cameras from little, which show what is worth matching; then from all matches that agree.
+"""First rough cameras, which show the pairs worth matching; then cameras from all that agrees.
 
 Two frames of a video that follow each other cannot be mistaken for others, so the cameras are found
 from tracks through every frame alone. With these cameras, the skeleton, each pair of frames that
@@ -37,25 +37,21 @@ from recon_cli.sfm.keyframes import (
     side_pairs,
     track_rows,
 )
+from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, MIN_PAIR_INLIERS
 from recon_cli.sfm.loop_closure import bend_model
 from recon_cli.sfm.matching import Pair, similar_pairs
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 from recon_cli.sfm.view_overlap import WIDEST, overlapping_pairs
 
-LINKED = "linked.db"  # matches that may be used, in the folder of an attempt
+MATCHES_DB = "linked.db"  # matches that may be used, in the folder of an attempt
 # Models in the folder of the attempts: from tracks, and from the coarsest features.
 SKELETON, COARSE_SKELETON = "skeleton", "skeleton.coarse"
 # Distances, in frames of a video, at which tracks are matches: enough for a path around a lost
 # frame. All up to 20 take twice as long; they are for videos that fall apart.
-STEPS, ALL_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
-ENOUGH = 0.9  # share of the frames that a skeleton must hold, else other mappers are tried
+TRACK_STEPS, ALL_TRACK_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
 REST_ROUNDS = 2  # adjustments with new points in between once all frames are placed
 BENDS = 2  # times that a model with open loops is bent and fitted again
-# COLMAP uses a pair of images from 15 matches on (TwoViewGeometryOptions.min_num_inliers).
-MIN_MATCHES = 15
-# Tracks count beside features where a pair has fewer matches than this: they are less exact.
-FEW_MATCHES = 100
-# Share of the neighbours with MIN_MATCHES tracks above which a video hangs together by them.
+# Share of the neighbours with MIN_PAIR_INLIERS tracks above which a video hangs together by them.
 CONTINUOUS = 0.5
 # Pairs of photos that overlap, per image: more than of frames, as they have no neighbours. 50
 # frames of each of two rooms as photos: .024 and .045% of the extent with 8, .020 and .034% with
@@ -76,8 +72,8 @@ def is_continuous(job: MappingJob) -> bool:
         return False
     tracks = _read_tracks(job)
     shared = [len(tracks.matches(index, index + 1)[0]) for index in range(len(tracks.names) - 1)]
-    linked = sum(count >= MIN_MATCHES for count in shared)
-    return len(tracks.names) == len(job.names) and linked > CONTINUOUS * len(shared)
+    following = sum(count >= MIN_PAIR_INLIERS for count in shared)
+    return len(tracks.names) == len(job.names) and following > CONTINUOUS * len(shared)
 
 
 def list_keyframes(job: MappingJob) -> tuple[str, ...]:
@@ -130,7 +126,7 @@ def load_skeleton(
             return build_skeleton(job, images)
         # Pairs that were matched would count against the model, but not where it is built first.
         copy = fresh_folder(job.attempts / f"{SKELETON}.partial") / "images.db"
-        shutil.copyfile(replace(job, linked=None).database, copy)
+        shutil.copyfile(replace(job, matches_db=None).database, copy)
         database.clear_matches(copy)
         return build_skeleton(job, copy)
 
@@ -190,7 +186,7 @@ def choose_coarse_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
 def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the models that the coarsest features alone give, the largest first."""
     folder = fresh_folder(job.attempts / f"{COARSE_SKELETON}.mapping")
-    coarse = replace(job, linked=folder / LINKED)
+    coarse = replace(job, matches_db=folder / MATCHES_DB)
     copy_coarsest(job.database, coarse.database)
     pairs = matching.exhaustive_pairs(job.names)
     if len(job.names) > matching.EXHAUSTIVE_MAX:
@@ -224,21 +220,21 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
     """Returns the models that tracks alone give, the largest first; a database has the images."""
     silent = Reporter(io.BytesIO())
     folder = fresh_folder(job.attempts / f"{SKELETON}.mapping")
-    linked = replace(job, linked=folder / LINKED)
+    own = replace(job, matches_db=folder / MATCHES_DB)
     tracks = _read_tracks(job)
     keyframes = choose_keyframes(tracks)
     tracks = tracks.select({row: tracks.names[row] for row in keyframes})
     rows = range(len(keyframes))
-    link(linked, images, {}, tracks, rows)
-    models = mapper.map_incrementally(linked, silent)
+    write_usable_matches(own, images, {}, tracks, rows)
+    models = mapper.map_incrementally(own, silent)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
     # without parallax. What tracks of a long video leave apart is left to the matches.
     whole = len(keyframes) == len(job.names)
     for find_models in (mapper.map_relaxed, mapper.map_globally) if whole else ():
-        if _most(models) >= ENOUGH * len(keyframes):
+        if _most(models) >= ENOUGH_FRAMES * len(keyframes):
             break
-        link(linked, images, {}, tracks, rows, steps=ALL_STEPS)
-        models = max(models, find_models(linked, silent), key=_most)
+        write_usable_matches(own, images, {}, tracks, rows, steps=ALL_TRACK_STEPS)
+        models = max(models, find_models(own, silent), key=_most)
     shutil.rmtree(folder)
     models.sort(key=mapper.model_size, reverse=True)
     return models
@@ -247,20 +243,20 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
 def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
     """Returns the models that the tracks and the matches that agree with them give.
 
-    `job.linked` names the database that is written and mapped from.
+    `job.matches_db` names the database that is written and mapped from.
     """
     models = load_skeleton(job, report)
-    source = replace(job, linked=None).database
+    source = replace(job, matches_db=None).database
     tracks = _read_tracks(job)
-    geometries = read_verified(source)
+    geometries = matching.read_verified(source)
     checked = check_pairs(source, list_models(models), geometries)
     usable = {pair: geometry for pair, geometry in geometries.items()
               if pair not in checked.contradicting}
     keyframes = choose_keyframes(tracks)
-    if _most(models) >= ENOUGH * len(keyframes):
-        link(job, source, usable, tracks, keyframes)
+    if _most(models) >= ENOUGH_FRAMES * len(keyframes):
+        write_usable_matches(job, source, usable, tracks, keyframes)
         return [_place_rest(job, close_loops(job, report, _fit(job, models[0])))]
-    link(job, source, usable, tracks, keyframes, steps=ALL_STEPS)
+    write_usable_matches(job, source, usable, tracks, keyframes, steps=ALL_TRACK_STEPS)
     if len(keyframes) == len(job.names):
         return mapper.map_relaxed(job, report)
     found = mapper.map_relaxed(job, report, [tracks.names[row] for row in keyframes])
@@ -276,7 +272,7 @@ def close_loops(
 ) -> pycolmap.Reconstruction:
     """Returns a fitted model, bent where loops are open and fitted again to what then agrees."""
     for _ in range(BENDS):
-        geometries = read_verified(replace(job, linked=None).database)
+        geometries = matching.read_verified(replace(job, matches_db=None).database)
         bent = bend_model(fitted, geometries, seed=job.seed)
         if bent is None:
             break
@@ -290,18 +286,18 @@ def _fit_where_it_meets(
 ) -> pycolmap.Reconstruction:
     """Returns a model fitted to the matches of frames that overlap by it, but not by those before.
 
-    `job.linked` is written anew with all that does not contradict the model.
+    `job.matches_db` is written anew with all that does not contradict the model.
     """
-    source, tracks = replace(job, linked=None), _read_tracks(job)
+    source, tracks = replace(job, matches_db=None), _read_tracks(job)
     met = overlapping_pairs(model).difference(
         *(overlapping_pairs(other, WIDEST) for other in before))
     if met - database.pair_names(source.database):
         matching.match_pairs(source, met, report)
         database.seal(source.database)
         report.phase("mapping", len(job.names))
-    geometries = read_verified(source.database)
+    geometries = matching.read_verified(source.database)
     checked = check_pairs(source.database, list_models([model]), geometries)
-    link(job, source.database, {
+    write_usable_matches(job, source.database, {
         pair: geometry for pair, geometry in geometries.items()
         if pair not in checked.contradicting}, tracks, choose_keyframes(tracks))
     return _fit(job, model)
@@ -313,7 +309,7 @@ def complete_coarse(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstr
     Where these placed too few, the models that the matches give by themselves.
     """
     models = _load_models(job, COARSE_SKELETON, lambda: build_coarse_skeleton(job, report))
-    if _most(models) < ENOUGH * len(job.names):
+    if _most(models) < ENOUGH_FRAMES * len(job.names):
         return mapper.map_incrementally(job, report)
     report.phase("mapping", len(job.names))
     return [_place_rest(job, _fit(job, models[0]))]
@@ -341,26 +337,11 @@ def _place_rest(job: MappingJob, model: pycolmap.Reconstruction) -> pycolmap.Rec
     return model if complete else mapper.extend_model(job, model)
 
 
-def read_verified(path: Path) -> dict[Pair, pycolmap.TwoViewGeometry]:
-    """Returns the verified matches of all pairs in a database; the names of a pair in order."""
-    verified = {}
-    with pycolmap.Database.open(path) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            first, second = (names[i] for i in pycolmap.pair_id_to_image_pair(number))
-            if first > second:
-                first, second = second, first
-                geometry.invert()
-            if len(geometry.inlier_matches) >= MIN_MATCHES:
-                verified[first, second] = geometry
-    return verified
-
-
-def link(
+def write_usable_matches(
     job: MappingJob, source: Path, geometries: Mapping[Pair, pycolmap.TwoViewGeometry],
-    tracks: Tracks, keyframes: Sequence[int], *, steps: Sequence[int] = STEPS,
+    tracks: Tracks, keyframes: Sequence[int], *, steps: Sequence[int] = TRACK_STEPS,
 ) -> None:
-    """Writes the database `job.linked`: images and keypoints of another one, and these matches.
+    """Writes the database `job.matches_db`: images and keypoints of another one, and these matches.
 
     Observations of tracks follow the keypoints of an image. Where features gave few matches, they
     tie keyframes, by row, that are so many `steps` of them apart, and others to those beside them.
@@ -407,10 +388,10 @@ def _match_tracks(
     for first, second in rows:
         pair = tracks.names[first], tracks.names[second]
         known = geometries.get(pair)
-        if known is not None and len(known.inlier_matches) >= FEW_MATCHES:
+        if known is not None and len(known.inlier_matches) >= FEW_PAIR_MATCHES:
             continue
         shown = np.stack(tracks.matches(first, second), axis=1)
-        if len(shown) >= MIN_MATCHES:
+        if len(shown) >= MIN_PAIR_INLIERS:
             matched[pair] = shown - start[[first, second]]
     return matched
 

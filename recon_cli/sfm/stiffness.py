@@ -2,7 +2,7 @@
 
 Scale passes from one stretch of a walk to the next by points that both have triangulated by
 themselves. Where a camera turns on the spot or in a narrow place there are few, or their rays
-hardly open, and the model may go on in another scale without any error to be seen.
+hardly open, and the model may continue in another scale without a visible error.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How long finding the cameras takes, told before it starts.
+"""How long finding the cameras takes, said before it starts.
 
 It follows from the frames, their size and the way they go, and from how fast this machine is right
 now: a piece of work of the same kind, for a fraction of a second on all threads. That a model falls
-short, so that another mapper is tried, cannot be known before; it is told when it happens.
+short, so that another mapper is tried, cannot be known before; it is said when it happens.
 `tests/bench/bench_sfm_estimate.py` compares with what finished workspaces took, and fits `COSTS`.
 """
 
@@ -17,9 +17,9 @@ import numpy as np
 
 # Seconds of the piece of work on the machine of `COSTS`, on a core that has nothing else to do.
 PIECE_SECONDS = 0.015
-TRIES = 15
+MEASURES = 15
 BLURS = (1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
-LEAST_TOLD = 60.0  # seconds that are worth a notice
+LEAST_NOTICE = 60.0  # seconds that are worth a notice
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ class Costs:
 COSTS = Costs(
     walk=0.12, walk_megapixel=0.48, keyframe=0.34, walk_mapping=0.15,
     photo=0.28, photo_megapixel=0.38, photo_mapping=0.17, split=1.0, join=0.2)
-OVERLAP = 1 / 6  # of a segment's frames, which are mapped in the next one as well
+OVERLAP_SHARE = 1 / 6  # of a segment's frames, which are mapped in the next one as well
 
 
 def list_work(work: Workload) -> dict[str, tuple[float, bool]]:
     """Returns how often each of `Costs` is paid, and whether all cores share it."""
     kind = "walk" if work.tracked else "photo"
     apart = work.segments > 1
-    frames = work.frames * (1 + OVERLAP) if apart else float(work.frames)
+    frames = work.frames * (1 + OVERLAP_SHARE) if apart else float(work.frames)
     mapped = frames * (work.keyframes or work.frames) / work.frames
     items = {kind: (frames, True), f"{kind}_megapixel": (frames * work.megapixels, True),
              f"{kind}_mapping": (mapped, apart)}
@@ -98,7 +98,7 @@ def measure_slowness(threads: int) -> float:
     cv2.setNumThreads(1)
     try:
         with ThreadPoolExecutor(threads) as pool:
-            seconds = list(pool.map(take, range(TRIES * threads)))
+            seconds = list(pool.map(take, range(MEASURES * threads)))
     finally:
         cv2.setNumThreads(before)
     return float(np.mean(seconds)) / PIECE_SECONDS
@@ -111,9 +111,9 @@ def format_minutes(seconds: float) -> str:
     return f"{text} minute{'s' if text != '1' else ''}"
 
 
-def tell_seconds(work: Workload, threads: int) -> float | None:
-    """Returns the seconds that are told in advance; None where they are too few to be told."""
+def estimate_for_notice(work: Workload, threads: int) -> float | None:
+    """Returns the seconds that a notice says in advance; None where they are too few for one."""
     seconds = expected_seconds(work, threads)
-    if seconds > LEAST_TOLD / 2:  # else the measure is not worth its time
+    if seconds > LEAST_NOTICE / 2:  # else the measure is not worth its time
         seconds *= measure_slowness(threads)
-    return seconds if seconds >= LEAST_TOLD else None
+    return seconds if seconds >= LEAST_NOTICE else None

@@ -2,7 +2,7 @@
 
 A mapper goes wrong in few places, and what lies on either side of one is usually right. So a model
 is cut where the verdict finds it broken, each side is adjusted and examined by itself, and cut
-again where it is broken too. A capture that fell into several models is in parts as well. Nothing
+again where it is broken too. A capture that split into several models is in parts as well. Nothing
 is known of how one part lies to another, nor of the ratio of their scales.
 """
 
@@ -11,10 +11,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
+import numpy as np
+
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, mapper
 from recon_cli.sfm.job import MappingJob
+from recon_cli.sfm.limits import MIN_FRAMES, MIN_IMAGES_PRINCIPAL
 from recon_cli.sfm.merge_models import ModelCandidate, drop_outliers
 from recon_cli.sfm.verdict import (
     MAX_LEAP,
@@ -28,25 +31,26 @@ from recon_cli.sfm.verdict import (
 Names = tuple[str, ...]
 
 # Frames of a part beside the largest, a tenth of the capture within these bounds: 20 are worth a
-# scene, and fewer than 10 cannot tell the principal point (`mapper.MIN_IMAGES_PRINCIPAL`).
-FEWEST, ENOUGH = 10, 20
+# scene, and fewer than 10 cannot tell the principal point (`limits`).
+FEWEST_FRAMES, WORTH_FRAMES = MIN_IMAGES_PRINCIPAL, 20
 _MOST_NAMED = 5  # parts in an error
 
 
 def deliver_parts(
-    job: MappingJob, whole: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
+    job: MappingJob, model: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
 ) -> list[ModelCandidate]:
     """Returns the parts of a capture that can be trusted, the largest first.
 
-    `others` are models beside the `whole` one. --accept-weak and --no-partial keep that as it is.
+    `others` are models beside the largest one, `model`. --accept-weak and --no-partial keep that as
+    it is.
     SfmError if the parts hold less than --min-registered of the frames together, or show them from
     nearly one place.
     """
-    parts = [whole]
+    parts = [model]
     if cuts_models(job):
-        found = find_parts(job, whole, others)
+        found = find_parts(job, model, others)
         parts = [part for part in found if checks.shows_depth(_angle(part))] or found[:1]
-        _check_share(job, whole.verdict, parts)
+        _check_share(job, model.verdict, parts)
     checks.check_registered(
         job.names, [name for part in parts for name in mapper.list_registered(part.model)],
         job.min_registered)
@@ -62,42 +66,42 @@ def cuts_models(job: MappingJob) -> bool:
 
 def least_frames(job: MappingJob) -> int:
     """Returns how many frames a part beside the largest must have."""
-    return min(max(len(job.names) // 10, FEWEST), ENOUGH)
+    return min(max(len(job.names) // 10, FEWEST_FRAMES), WORTH_FRAMES)
 
 
 def find_parts(
-    job: MappingJob, whole: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
+    job: MappingJob, model: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
 ) -> list[ModelCandidate]:
     """Returns the largest part that can be trusted, of three cameras or more, and others.
 
     The points of a model that has none are triangulated.
     """
     least = least_frames(job)
-    parts = list(_cut(job, whole, checks.MIN_FRAMES))
+    parts = list(_cut(job, model, MIN_FRAMES))
     for other in sorted(others, key=mapper.model_size, reverse=True):
         held = {name for part in parts for name in mapper.list_registered(part.model)}
         names = set(mapper.list_registered(other)) - held
         if len(names) >= least:
-            model = other if other.num_points3D() else mapper.triangulate(job, other)
-            part = drop_outliers(job, mapper.sharpen(_cut_out(model, names)))
+            full = other if other.num_points3D() else mapper.triangulate(job, other)
+            part = drop_outliers(job, mapper.sharpen(_cut_out(full, names)))
             parts += _cut(job, part, least)
     parts.sort(key=lambda part: mapper.model_size(part.model), reverse=True)
     return [part for index, part in enumerate(parts)
             if not index or part.model.num_reg_images() >= least]
 
 
-def _cut(job: MappingJob, whole: ModelCandidate, least: int) -> Iterator[ModelCandidate]:
+def _cut(job: MappingJob, model: ModelCandidate, least: int) -> Iterator[ModelCandidate]:
     """Yields the trusted parts of a model: of so many cameras, and others of those it must have."""
-    if whole.verdict.trusted:
-        yield whole
+    if model.verdict.trusted:
+        yield model
         return
-    sides = [(names, whole.rejected) for names in _sides(
-        job, mapper.list_registered(whole.model), whole.verdict)]
+    sides = [(names, model.rejected) for names in _sides(
+        job, mapper.list_registered(model.model), model.verdict)]
     while sides:
         names, rejected = sides.pop(max(range(len(sides)), key=lambda i: len(sides[i][0])))
         if len(names) < least:
             continue
-        part = drop_outliers(job, _cut_out(whole.model, names))
+        part = drop_outliers(job, _cut_out(model.model, names))
         part = dataclasses.replace(part, rejected={**rejected, **part.rejected})
         cameras = mapper.list_registered(part.model)
         if not part.verdict.trusted:
@@ -118,10 +122,11 @@ def _check_share(
     if parts and (count >= job.min_registered * len(job.names) or not broken):
         return
     named = "; ".join(f"{len(names)} ({names[0]} to {names[-1]})" for names in held[:_MOST_NAMED])
+    problem = (verdict.problems or ("The capture split into disconnected models.",))[0]
     raise SfmError(
-        f"{verdict.problems[0] if verdict.problems else 'The capture fell apart.'} The parts that "
-        f"can be trusted on their own hold {count} of {len(job.names)} frames together"
-        f"{f', {named}' if named else ''}, but --min-registered asks for {job.min_registered:.0%}.",
+        f"{problem} The parts that can be trusted on their own hold {count} of {len(job.names)} "
+        f"frames together{f', {named}' if named else ''}, but --min-registered asks for "
+        f"{job.min_registered:.0%}.",
         hint="Use more frames between the parts (`recon ingest --frames N`), match all of "
         "them (--pairs exhaustive), accept the parts with a lower --min-registered, or keep the "
         "largest model as it is with --accept-weak.")
@@ -157,4 +162,4 @@ def _cut_out(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap
 
 def _angle(part: ModelCandidate) -> float:
     """Returns the median of the widest angles that points are seen at, degrees."""
-    return float(mapper.describe_model(part.model)["median_triangulation_angle_deg"])
+    return float(np.median(mapper.triangulation_angles(part.model)))

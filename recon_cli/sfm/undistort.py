@@ -20,10 +20,11 @@ from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.room.scale import ScaleBetween
-from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.align_world import world_transform
-from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, Result, fresh_folder, publish
+from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
+from recon_cli.sfm.results import PlacedResult, UndistortedResult
+from recon_cli.sfm.shared_points import to_sim3d
 from recon_cli.workspace import atomic
 from recon_cli.workspace.records import read_poses
 from recon_cli.workspace.summaries import WorldSummary
@@ -31,11 +32,11 @@ from recon_cli.workspace.summaries import WorldSummary
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 
 
-def place_model(job: MappingJob) -> Result:
+def place_model(job: MappingJob) -> PlacedResult:
     """Writes the model of the job's part, moved into the world frame, into out/sparse.
 
-    The axes of a data set with poses are left as they are. Returns a `WorldSummary` as JSON values;
-    ConfigError if the part, or a place of --scale-between, is unknown.
+    The axes of a data set with poses are left as they are. ConfigError
+    if the part, or a place of --scale-between, is unknown.
     """
     check_part(job)
     part = job.parts / str(job.part)
@@ -49,21 +50,15 @@ def place_model(job: MappingJob) -> Result:
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
         metric=job.known_poses and job.poses is not None and read_poses(job.poses).metric,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()})
-    move_model(model, world.similarity)
+    model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")
     write_model(model, folder)
     publish(folder, job.out / "sparse")
-    summary = world.summary().to_json()
-    atomic.write_json(job.out / WorldSummary.FILE, summary)
+    summary = world.summary()
+    atomic.write_json(job.out / WorldSummary.FILE, summary.to_json())
     if (part / VERDICT).exists():
         atomic.write_json(job.out / VERDICT, atomic.read_json(part / VERDICT))
-    return summary
-
-
-def move_model(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
-    """Moves cameras and points of `model`; each observation keeps its reprojection error."""
-    model.transform(pycolmap.Sim3d(
-        similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
+    return PlacedResult(world=summary)
 
 
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:
@@ -72,7 +67,7 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
     return Pinhole(flat.width, flat.height, *flat.params)
 
 
-def undistort(job: MappingJob, report: Reporter) -> Result:
+def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
     """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
     model = pycolmap.Reconstruction(job.out / SPARSE)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
@@ -101,12 +96,12 @@ def undistort(job: MappingJob, report: Reporter) -> Result:
         for count, _ in enumerate(pool.map(write, names), 1):
             report.done(count)
     counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
-    cameras = [
+    cameras = tuple(
         {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
          "frames": counts[index]}
-        for index, camera in sorted(flat.cameras.items())]
+        for index, camera in sorted(flat.cameras.items()))
     publish(work, job.out / "undistorted")
-    return {"cameras": cameras}
+    return UndistortedResult(cameras=cameras)
 
 
 def _write_model(

@@ -8,10 +8,9 @@ over bare walls (`still_points`).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import Any
@@ -19,22 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import SfmError, list_names
+from recon_cli.errors import SfmError, format_count, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
+from recon_cli.sfm.limits import FEW_KEYPOINTS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
 from recon_cli.sfm.open_loops import OpenLoop, find_open_loops
-from recon_cli.sfm.scale_drift import MAX_ERROR, ScaleCut, find_weakest_scale, is_scale_known
+from recon_cli.sfm.scale_drift import MAX_SCALE_ERROR, ScaleCut, find_weakest_scale, is_scale_known
 from recon_cli.sfm.still_points import MAX_STILL, find_still_share
 from recon_cli.sfm.visual_aliasing import VisualAliasing
-from recon_cli.sfm.weakest_cut import (
-    MIN_AGREEING,
-    MIN_EXPLAINED,
-    MIN_MATCHES,
-    OutlierCamera,
-    WeakestCut,
-    find_weakest_cut,
-)
+from recon_cli.sfm.weakest_cut import OutlierCamera, WeakestCut, find_weakest_cut
+from recon_cli.workspace.json_record import KEY, JsonRecord
 
 # A jump is a step of this multiple of the usual one, the median of those around it. Longest steps
 # measured: 1.1 to 2.8 in good models, 9 to 20 where cameras are displaced.
@@ -43,9 +37,6 @@ WINDOW = 15  # steps; a median over fewer follows the jump itself
 MIN_STEPS = 5  # fewer say nothing about what is usual
 # Longer steps cannot be a cut in a video: displaced cameras gave 9 to 20, a walk's end at rest 6.
 MAX_LEAP = 100.0
-# COLMAP gives an image a camera from 30 inliers on, and in six of eight captures 19 of 20 images
-# had a fifth of their keypoints or more in the model. The fewest of any image with a camera: 450.
-MIN_KEYPOINTS = 150
 # Share of the median sharpness below which an image is called blurred, as in IngestConfig.
 BLURRED = 0.5
 MOST_LINES = 5  # for images without a camera; all of them are in the verdict
@@ -56,11 +47,10 @@ BINS = 10
 MAX_SHIFT = 0.1
 
 Names = tuple[str, ...]
-_JSON_KEYS = {"weakest_cut": "weak_link", "aliasing": "fold", "outliers": "astray"}
 
 
 @dataclass(frozen=True)
-class Jump:
+class Jump(JsonRecord):
     """A step between two images that follow each other."""
 
     before: str
@@ -69,7 +59,7 @@ class Jump:
 
 
 @dataclass(frozen=True)
-class Histogram:
+class Histogram(JsonRecord):
     """How many values fall between edges."""
 
     edges: tuple[int, ...]  # bin k holds the values from edges[k] up to, but without, edges[k + 1]
@@ -77,7 +67,7 @@ class Histogram:
     median: float  # of all values; zero without any
 
     @classmethod
-    def of(cls, values: NDArray[np.int64]) -> Histogram:
+    def from_values(cls, values: NDArray[np.int64]) -> Histogram:
         """Returns the histogram of whole numbers, [N], from zero up, in ten bins of one width."""
         top = int(values.max()) if len(values) else 0
         width = top // BINS + 1
@@ -88,7 +78,7 @@ class Histogram:
 
 
 @dataclass(frozen=True)
-class ModelVerdict:
+class ModelVerdict(JsonRecord):
     """Whether a model can be trusted, and why not; images by name."""
 
     images: int  # that were given to the mapper
@@ -97,14 +87,14 @@ class ModelVerdict:
     model_parts: tuple[Names, ...]
     # The same of all images and verified matches: what could be mapped together.
     match_parts: tuple[Names, ...]
-    weakest_cut: WeakestCut
-    aliasing: VisualAliasing
-    outliers: tuple[OutlierCamera, ...]
+    weakest_cut: WeakestCut = field(metadata={KEY: "weak_link"})
+    aliasing: VisualAliasing = field(metadata={KEY: "fold"})
+    outliers: tuple[OutlierCamera, ...] = field(metadata={KEY: "astray"})
     unregistered: Mapping[str, str]  # why each image without a camera has none
     jumps: tuple[Jump, ...]  # far too long steps of the camera; empty unless a video
     keypoints: Histogram  # of each image
     points: Histogram  # of the model that each camera sees
-    neighbours: Histogram  # of each camera, those with which it shares MIN_MATCHES points
+    neighbours: Histogram  # of each camera, those with which it shares MIN_POSE_INLIERS points
     still: float  # share of the points in three or more images that do not move in them
     # Of a walk: where the relative scale of both sides is known least, between the stretches of an
     # open loop where there is one; None where nothing tells.
@@ -135,24 +125,22 @@ class ModelVerdict:
         cut, aliasing = self.weakest_cut, self.aliasing
         shares = []
         if cut.share is not None:
-            shares.append(
-                f"{cut.share:.0%} of what their closest images have in common is one point in both")
+            shares.append(f"{cut.share:.0%} of the matches across the weakest cut are triangulated "
+                          "to one shared point")
         if cut.explained is not None:
             shares.append(f"the cameras explain {cut.explained:.0%} of the matches")
         if shares:
-            yield f"Weakest link, between {_sides(cut.sides)}: {', and '.join(shares)}."
+            yield f"Weakest cut, between {_sides(cut.sides)}: {', and '.join(shares)}."
         if aliasing.share is not None:
-            yield (f"Least overlap: two groups of cameras find {aliasing.share:.0%} as much of "
-                   "what both should show as cameras of one group do.")
+            yield (f"Least overlap: two groups of cameras see {aliasing.share:.0%} as much of the "
+                   "surfaces that they should share as cameras within one group do.")
         if self.scale is not None:
-            yield (f"Scale: what lies on either side of any moment of the walk is known to "
-                   f"{self.scale.error:.1%} or better against the other side.")
+            yield ("Scale: the two parts of the walk, before and after any frame, are known to "
+                   f"{self.scale.error:.1%} or better relative to each other.")
 
     def to_json(self) -> dict[str, Any]:
-        """Returns JSON values: the fields, some under their older keys, and `trusted`."""
-        values = {_JSON_KEYS.get(name, name): value
-                  for name, value in dataclasses.asdict(self).items()}
-        return {**values, "trusted": self.trusted}
+        """Returns JSON values: the fields, and whether the model is trusted."""
+        return {**super().to_json(), "trusted": self.trusted}
 
 
 def examine(
@@ -182,9 +170,10 @@ def examine(
         model_parts=model_parts, match_parts=match_parts,
         weakest_cut=weakest_cut, aliasing=aliasing, outliers=outliers,
         unregistered=explain_unregistered(evidence, sharpness or {}), jumps=jumps,
-        keypoints=Histogram.of(evidence.keypoints),
-        points=Histogram.of(evidence.points[rows]),
-        neighbours=Histogram.of(np.count_nonzero(evidence.shared[rows] >= MIN_MATCHES, axis=1)),
+        keypoints=Histogram.from_values(evidence.keypoints),
+        points=Histogram.from_values(evidence.points[rows]),
+        neighbours=Histogram.from_values(
+            np.count_nonzero(evidence.shared[rows] >= MIN_POSE_INLIERS, axis=1)),
         still=still, scale=scale, open_loops=loops,
         problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
                   *_describe_drift(loops, scale), *_describe_still(still),
@@ -214,7 +203,7 @@ def is_broken(cut: WeakestCut) -> bool:
 
 
 def _is_torn(cut: WeakestCut) -> bool:
-    return cut.share is not None and cut.share < MIN_AGREEING
+    return cut.share is not None and cut.share < MIN_ONE_POINT
 
 
 def is_aliased(aliasing: VisualAliasing) -> bool:
@@ -251,13 +240,13 @@ def _describe_problems(
     problems = [*_describe_break(cut), *_describe_aliasing(aliasing)]
     if len(parts) > 1:
         sizes = ", ".join(str(len(part)) for part in parts)
-        problems.append(f"The model has {len(parts)} parts, of {sizes} cameras, without a point in "
-                        "common.")
+        problems.append(f"The model has {len(parts)} parts, of {sizes} cameras, that share no "
+                        "point.")
     if outliers:
         problems.append("These cameras contradict the matches of their images: "
                         f"{list_names([camera.name for camera in outliers])}.")
     return problems + [
-        f"The camera leaps from {jump.before} to {jump.after}: {jump.ratio:.0f} times as far as "
+        f"The camera jumps from {jump.before} to {jump.after}: {jump.ratio:.0f} times as far as "
         f"usual, but at most {MAX_LEAP:.0f} times is possible."
         for jump in jumps if jump.ratio > MAX_LEAP]
 
@@ -267,24 +256,24 @@ def _describe_drift(loops: Sequence[OpenLoop], cut: ScaleCut | None) -> list[str
     if loops:
         loop = loops[0]
         return [
-            f"{loop.first} and {loop.second} show one place, as {loop.points} points in "
-            f"{loop.pairs} pairs of images say, but the model has it twice, "
-            f"{abs(loop.scale - 1):.0%} apart in scale and turned by {loop.turn_deg:.0f} degrees: "
-            f"the cameras drift on the way, most likely{where or ' in between'}."]
+            f"{loop.first} and {loop.second} show the same place ({loop.points} points in "
+            f"{loop.pairs} pairs of images match), but the model contains it twice, with scales "
+            f"{abs(loop.scale - 1):.0%} apart and turned by {loop.turn_deg:.0f} degrees: the "
+            f"cameras drifted, most likely{where or ' in between'}."]
     if cut is None or is_scale_known(cut):
         return []
     return [
-        f"How large the {len(cut.sides[0])} cameras on one side of the cut{where} are against the "
-        f"{len(cut.sides[1])} others is known to {cut.error:.0%} only, but {MAX_ERROR:.0%} is "
-        "needed: too little that both see shows depth."]
+        f"The scale of the {len(cut.sides[0])} cameras on one side of the cut{where} relative to "
+        f"the {len(cut.sides[1])} others is known to {cut.error:.0%} only, but "
+        f"{MAX_SCALE_ERROR:.0%} is needed: the two sides share too few points that show depth."]
 
 
 def _describe_still(share: float) -> list[str]:
     if share <= MAX_STILL:
         return []
     return [
-        f"{share:.0%} of the points stay where they are in the images while the camera moves, at "
-        f"most {MAX_STILL:.0%} may: text, a logo or dirt on the lens holds the model together."]
+        f"{share:.0%} of the points do not move in the image (an overlay or dirt on the lens), but "
+        f"at most {MAX_STILL:.0%} may."]
 
 
 def _describe_break(cut: WeakestCut) -> list[str]:
@@ -292,8 +281,9 @@ def _describe_break(cut: WeakestCut) -> list[str]:
         return []
     if _is_torn(cut):
         return [
-            f"The model is broken: of what the closest images of {_sides(cut.sides)} have in "
-            f"common, only {cut.share:.0%} is one point in both, but {MIN_AGREEING:.0%} is needed."]
+            f"The model is broken: of the matches between the closest images of "
+            f"{_sides(cut.sides)}, only {cut.share:.0%} are triangulated to one shared point, but "
+            f"{MIN_ONE_POINT:.0%} are needed."]
     return [
         f"The model is broken: of the matches between the closest images of {_sides(cut.sides)}, "
         f"only {cut.explained:.0%} agree with the cameras, but {MIN_EXPLAINED:.0%} must."]
@@ -303,15 +293,16 @@ def _describe_aliasing(aliasing: VisualAliasing) -> list[str]:
     if not is_aliased(aliasing):
         return []
     return [
-        f"{_sides(aliasing.sides)} should see the same surfaces, but find only "
-        f"{aliasing.share:.0%} as much of them in both as images on one side do, and "
+        f"{_sides(aliasing.sides)} should see the same surfaces, but share only "
+        f"{aliasing.share:.0%} as much of them as images within one side do, and "
         f"{visual_aliasing.MIN_OVERLAP:.0%} is needed: the model is broken between them, or two "
-        "places that look alike lie over each other."]
+        "places that look alike were placed on top of each other."]
 
 
 def _sides(sides: tuple[Names, Names]) -> str:
     first, second = sides
-    return f"{len(first)} cameras ({list_names(first, most=3)}) and the {len(second)} others"
+    named = f"{format_count(len(first), 'camera')} ({list_names(first, most=3)})"
+    return f"{named} and the {len(second)} others"
 
 
 def find_jumps(evidence: MatchEvidence, times: Mapping[str, float | None]) -> tuple[Jump, ...]:
@@ -381,7 +372,7 @@ def _reason(
     # A blurred image matches little. One that matches others well may show another room.
     if blur and matches[~placed].sum() <= matches[placed].sum():
         return f"blurred: {blur}"
-    if evidence.keypoints[index] < MIN_KEYPOINTS:
+    if evidence.keypoints[index] < FEW_KEYPOINTS:
         return f"too few features: {evidence.keypoints[index]} keypoints"
     if not placed.any():
         where = f", only with {len(others)} that have none" if len(others) else ""

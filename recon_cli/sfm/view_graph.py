@@ -71,7 +71,7 @@ def sweep(matrix: Weights, order: Order) -> NDArray[np.float64]:
 def spanning_forest(matrix: Weights) -> NDArray[np.bool_]:  # [N, N], symmetric
     """Returns the edges of the trees that hold the images together by the strongest ties.
 
-    Between the two sides of any of its edges there is no stronger tie than that edge.
+    No tie between the two sides of an edge of it is stronger than that edge.
     """
     lengths = np.divide(1.0, matrix, out=np.zeros_like(matrix), where=matrix > 0)
     tree = minimum_spanning_tree(lengths).toarray() > 0

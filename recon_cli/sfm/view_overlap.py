@@ -15,8 +15,8 @@ from recon_cli.sfm.matching import Pair
 # of them, in cm: .17 and .09, .17 and .10, .20 and .10.
 OVERLAPPING, WIDEST = 8, 60
 # Two views overlap as far as a point of one lies in the other, at a like angle and distance.
-MAX_ANGLE_DEG, MAX_RATIO, MIN_OVERLAP = 30.0, 2.0, 0.2
-SAMPLED = 150  # points per image
+MAX_VIEW_ANGLE_DEG, MAX_DISTANCE_RATIO, MIN_VIEW_OVERLAP = 30.0, 2.0, 0.2
+SAMPLED_POINTS = 150  # points per image
 
 
 def overlapping_pairs(model: pycolmap.Reconstruction, most: int = OVERLAPPING) -> set[Pair]:
@@ -47,7 +47,7 @@ def overlapping_images(
     names, pairs = [image.name for image in images], set()
     for row, shares in enumerate(mutual):
         others = [other for other in np.argsort(-shares, kind="stable").tolist()
-                  if shares[other] > MIN_OVERLAP and (
+                  if shares[other] > MIN_VIEW_OVERLAP and (
                       held is None or set(held[names[row]]).isdisjoint(held[names[other]]))]
         both = [(names[min(row, other)], names[max(row, other)]) for other in others]
         new = [pair for pair in both if pair not in besides]
@@ -61,7 +61,7 @@ def _sample_points(
     image: pycolmap.Image, places: Mapping[int, NDArray[np.float64]]
 ) -> NDArray[np.float64]:  # [S, 3]
     numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
-    step = max(1, len(numbers) // SAMPLED)
+    step = max(1, len(numbers) // SAMPLED_POINTS)
     return np.array([places[number] for number in numbers[::step]]).reshape(-1, 3)
 
 
@@ -85,8 +85,8 @@ def _overlap(
         others = points[rows] - centers[column]
         far = np.linalg.norm(others, axis=1)
         cosines = (rays[rows] * others).sum(axis=1)
-        alike = (cosines > np.cos(np.radians(MAX_ANGLE_DEG)) * near[rows] * far) & (
-            near[rows] < MAX_RATIO * far) & (far < MAX_RATIO * near[rows])
+        alike = (cosines > np.cos(np.radians(MAX_VIEW_ANGLE_DEG)) * near[rows] * far) & (
+            near[rows] < MAX_DISTANCE_RATIO * far) & (far < MAX_DISTANCE_RATIO * near[rows])
         share[:, column] = np.bincount(owner[rows[alike]], minlength=len(images))
     np.fill_diagonal(share, 0)
     return np.asarray(share / np.maximum(np.bincount(owner, minlength=len(images)), 1)[:, None])

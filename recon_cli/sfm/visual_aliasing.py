@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
+from recon_cli.workspace.json_record import JsonRecord
 
 # A point is expected in an image that sees it as nearly as another does: SIFT finds it again, while
 # at 20 degrees one in six is lost (Lowe 2004, fig. 9).
@@ -29,11 +30,11 @@ MAX_ANGLE_DEG = 10.0
 MAX_RATIO = 1.3
 # Cells along each side of an image, and points that a cell must expect to count. Of those 55 to 65%
 # are found in good models: all six are missed by chance one time in two hundred.
-GRID, MIN_POINTS = 6, 6
+GRID, MIN_CELL_POINTS = 6, 6
 # Points sampled per image, evenly; 1000 are 28 a cell.
 MAX_POINTS = 1000
 # A pair counts where each expects this share of its cells in the other: one may see through walls.
-MIN_SHARE = 0.25
+MIN_CELL_SHARE = 0.25
 MIN_CELLS = 100  # between two groups of images: a handful of pairs
 # Of what pairs within two groups of images find of their cells, the pairs between them must find so
 # much. See `tests/bench/bench_verdict.py`.
@@ -43,7 +44,7 @@ BANDS_DEG = (2.5, 5.0, 7.5)
 # A smaller share found within the groups is taken for this one: then they are wrong themselves.
 MIN_RATE = 0.6
 MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
-# A smaller share of the cameras is no half of a doubled place: blurred images match badly too.
+# A smaller share of the cameras is not half of a doubled place: blurred images match badly too.
 MIN_SIDE = 0.1
 
 
@@ -59,7 +60,7 @@ class Overlap:
 
 
 @dataclass(frozen=True)
-class VisualAliasing:
+class VisualAliasing(JsonRecord):
     """The two groups of images that show least of what they should show in common."""
 
     # Of the cells that should look alike, those that do, over the same for pairs within the groups;
@@ -102,7 +103,7 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
             expected[band, :, other] = (should & (bands == band)).sum(axis=1)
             confirmed[band, :, other] = (does & (bands == band)).sum(axis=1)
     share = expected.sum(axis=0) / np.maximum(cells.sum(axis=1), 1)[:, None]
-    mutual = (np.minimum(share, share.T) >= MIN_SHARE) & evidence.tried
+    mutual = (np.minimum(share, share.T) >= MIN_CELL_SHARE) & evidence.tried
     return Overlap(
         np.where(mutual, expected + expected.transpose(0, 2, 1), 0.0),
         np.where(mutual, confirmed + confirmed.transpose(0, 2, 1), 0.0))
@@ -128,7 +129,7 @@ def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
         if shares.min() < share:
             cut, share = order[:int(shares.argmin()) + 1], float(shares.min())
     if cut is None:
-        reason = f"no two groups of cameras should show the same in {MIN_CELLS} places"
+        reason = f"no two groups of cameras should share {MIN_CELLS} places"
         return VisualAliasing(None, reason, ((), ()), 0)
     side = np.zeros(len(rows), np.bool_)
     side[cut] = True
@@ -222,7 +223,7 @@ def _bands(
 
 
 def _cells(
-    samples: _Samples, chosen: NDArray[np.int64], count: int, least: int = MIN_POINTS
+    samples: _Samples, chosen: NDArray[np.int64], count: int, least: int = MIN_CELL_POINTS
 ) -> NDArray[np.bool_]:  # [N, GRID * GRID]
     """Returns the cells of `count` images that hold at least so many of the chosen samples."""
     held = np.bincount(samples.cell[chosen], minlength=count * GRID * GRID)

@@ -23,31 +23,25 @@ from numpy.typing import NDArray
 
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
+from recon_cli.sfm.limits import MIN_EXPLAINED, MIN_ONE_POINT, MIN_PAIR_INLIERS, MIN_POSE_INLIERS
 from recon_cli.sfm.view_graph import Cut, Weights
+from recon_cli.workspace.json_record import JsonRecord
 
-# Share of the matches of a pair that must show one point, and that the cameras must explain. See
-# `tests/bench/bench_verdict.py`.
-MIN_AGREEING = 0.7
-MIN_EXPLAINED = 0.6
 # Images that each one has most matches with.
 STRONGEST = 5
 # Of the ties of a wrong camera so many at least contradict it; beside a break it is half of them.
 WRONG = 0.75
 # Images that stand at most so many apart in their order are next to each other.
 REACH = 2
-# COLMAP verifies a pair from 15 inliers on (TwoViewGeometryOptions.min_num_inliers).
-MIN_TRACED = 15
-# COLMAP gives an image a camera from 30 inliers on (abs_pose_min_num_inliers).
-MIN_MATCHES = 30
 # Sides of up to this share of the cameras are outliers, which can be dropped.
 MAX_OUTLIERS = 0.1
 
 
 @dataclass(frozen=True)
-class WeakestCut:
+class WeakestCut(JsonRecord):
     """The cut through a model across which matches least show the same points."""
 
-    # Of the matches of a pair of images across, those that show one point of the model, as far as
+    # Of the matches of a pair of images across, the share that shows one point of the model, where
     # their keypoints show any: the median of the pairs that count; None if unknown.
     share: float | None
     # Of the matches of those pairs, the share that the cameras explain: of all together or the
@@ -63,33 +57,33 @@ class WeakestCut:
 
 
 @dataclass(frozen=True)
-class OutlierCamera:
+class OutlierCamera(JsonRecord):
     """A camera that the image's own matches contradict."""
 
     name: str
-    share: float  # of its matches with cameras that are no outliers, those that agree
+    share: float  # of its matches with cameras that are not outliers, those that agree
     matches: int  # with such cameras
-    rival: str = ""  # of those, the one that contradicts it by most matches; empty without any
-    joined: float | None = None  # of what both show, the share that is one point in both
+    rival: str  # of those, the one that contradicts it by most matches; empty without any
+    joined: float | None  # of what both show, the share that is one point in both
 
     @property
     def reason(self) -> str:
         """What it contradicts, in words."""
-        text = f"{self.share:.0%} of its {self.matches} matches agree with where it was placed"
+        text = f"{self.share:.0%} of its {self.matches} matches agree with its pose"
         if self.joined is None:
             return text
-        return f"{text}, but {self.joined:.0%} of what {self.rival} shows too is one point in both"
+        return f"{text}, and only {self.joined:.0%} of those with {self.rival} show one point"
 
 
 def find_weakest_cut(
     evidence: MatchEvidence, order: NDArray[np.int64] | None = None
 ) -> tuple[WeakestCut, tuple[OutlierCamera, ...]]:
-    """Returns the weakest cut of the cameras that are no outliers, and the outliers.
+    """Returns the weakest cut of the cameras without the outliers, and the outliers.
 
     `order` are the images with a camera as they were taken, where that is known. Wrong cameras and
     other small sides of broken cuts are removed one by one, so that none hides behind another.
     """
-    links = _Links.of(evidence)
+    links = _Links.from_evidence(evidence)
     allowed = max(1, int(MAX_OUTLIERS * np.count_nonzero(evidence.registered)))
     inliers = _drop_wrong_cameras(links, evidence.registered, allowed)
     while (weakest := _weakest_side(links, inliers, order)) is not None:
@@ -99,7 +93,8 @@ def find_weakest_cut(
             return (_cut(evidence, links, side, inliers, strength),
                     _outliers(evidence, links, inliers))
         inliers &= ~side
-    reason = f"no two parts have a pair of images with {MIN_TRACED} matched points between them"
+    reason = (f"no two parts have a pair of images with {MIN_PAIR_INLIERS} matched points between "
+              "them")
     return (WeakestCut(None, None, reason, ((), ()), 0, 0, 0, 0.0),
             _outliers(evidence, links, inliers))
 
@@ -111,7 +106,8 @@ def _agrees(links: _Links, side: Cut, inliers: Cut) -> bool:
     """
     across = np.ix_(side, inliers & ~side)
     matches = links.matches[across].sum()
-    return bool(matches >= MIN_MATCHES and links.agreeing[across].sum() >= MIN_AGREEING * matches)
+    agreeing = links.agreeing[across].sum()
+    return bool(matches >= MIN_POSE_INLIERS and agreeing >= MIN_ONE_POINT * matches)
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,7 @@ class _Strength:
     @property
     def order(self) -> tuple[bool, float]:
         """Least for the weakest: one that is torn, then the lesser of the two over their bounds."""
-        share = self.share / MIN_AGREEING
+        share = self.share / MIN_ONE_POINT
         return share >= 1, min(share, self.explained / MIN_EXPLAINED)
 
     @property
@@ -144,7 +140,7 @@ class _Links:
     shares: Weights  # of the matches, those that show one point; NaN where too few show any
 
     @classmethod
-    def of(cls, evidence: MatchEvidence) -> _Links:
+    def from_evidence(cls, evidence: MatchEvidence) -> _Links:
         """Returns the matrices; matches of images without a camera are left out."""
         count, placed = len(evidence.names), evidence.placed
         pairs = evidence.pairs[placed]
@@ -153,10 +149,10 @@ class _Links:
                 evidence.matches, evidence.agreeing, evidence.explained, evidence.traced,
                 evidence.joined))
         shares = np.divide(
-            joined, traced, out=np.full_like(traced, np.nan), where=traced >= MIN_TRACED)
+            joined, traced, out=np.full_like(traced, np.nan), where=traced >= MIN_PAIR_INLIERS)
         # A camera far from where it belongs sees no points at all; its matches speak all the same.
-        blind = evidence.points < MIN_TRACED
-        shares[(blind[:, None] | blind) & (matches >= MIN_MATCHES)] = 0.0
+        blind = evidence.points < MIN_PAIR_INLIERS
+        shares[(blind[:, None] | blind) & (matches >= MIN_POSE_INLIERS)] = 0.0
         return cls(matches, agreeing, explained, evidence.shared.astype(np.float64), shares)
 
 
@@ -179,7 +175,7 @@ def _drop_wrong_cameras(links: _Links, registered: Cut, allowed: int) -> Cut:  #
         shares = [_quantile(row[tied], WRONG)
                   for row, tied in zip(links.shares[inner], ties, strict=True)]
         worst = int(np.argmin(shares)) if shares else 0
-        if not shares or shares[worst] >= MIN_AGREEING:
+        if not shares or shares[worst] >= MIN_ONE_POINT:
             return inliers
         inliers[rows[worst]] = False
     return registered.copy()
@@ -220,7 +216,7 @@ def _explained_share(
 ) -> float:
     """Returns the share of matches of pairs that is explained; infinity where they are too few."""
     some = matches > 0
-    if np.count_nonzero(some) < 2 or matches.sum() < MIN_MATCHES:
+    if np.count_nonzero(some) < 2 or matches.sum() < MIN_POSE_INLIERS:
         return np.inf
     return float(max(
         explained.sum() / matches.sum(), np.median(explained[some] / matches[some])))
@@ -269,7 +265,7 @@ def _outliers(evidence: MatchEvidence, links: _Links, inliers: Cut) -> tuple[Out
     for index in np.flatnonzero(evidence.registered & ~inliers):
         matches = links.matches[index, others]
         share = links.agreeing[index, others].sum() / max(matches.sum(), 1.0)
-        wrong = np.where(links.shares[index, others] < MIN_AGREEING, matches, 0)
+        wrong = np.where(links.shares[index, others] < MIN_ONE_POINT, matches, 0)
         worst = int(others[wrong.argmax()]) if wrong.any() else None
         outliers.append(OutlierCamera(
             evidence.names[index], float(share), int(matches.sum()),

@@ -12,6 +12,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -36,9 +37,9 @@ from recon_cli.sfm.job import (
     VERDICT,
     MappingJob,
     Reporter,
-    Result,
     StepLog,
 )
+from recon_cli.sfm.results import RESULTS, CountedResult, StepResult
 from recon_cli.signals import leave_to_parent
 from recon_cli.workspace.disk import find_space_errno
 from recon_cli.workspace.summaries import WorldSummary
@@ -53,7 +54,7 @@ _BESIDES = {"model": (join_segments.REPORT,), "sparse": (WorldSummary.FILE, VERD
 def work(job: MappingJob, report: Reporter) -> None:
     """Runs unfinished steps; SfmError if no model can be trusted, FormatError for a bad frame."""
     deadline = time.monotonic() + 60 * job.max_minutes
-    actions: dict[str, Callable[[], Result]] = {
+    actions: dict[str, Callable[[], StepResult]] = {
         "features": lambda: fallbacks.find_features(job, report),
         "matches": lambda: (
             known_poses.match_known if job.known_poses else fallbacks.match_first)(job, report),
@@ -65,19 +66,19 @@ def work(job: MappingJob, report: Reporter) -> None:
         "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)
     rematch = _forget_damaged(job, log, report)
-    mapped = job.last == STEPS[-1] and log.result("model") is not None
+    mapped = job.last == STEPS[-1] and log.is_finished("model")
     if "features" in job.steps and not mapped:  # else nothing reads it any more
         _prepare_database(job, log, report, rematch=rematch)
     for step in job.steps:
-        if log.result(step) is not None:
+        if log.result(step, RESULTS[step]) is not None:
             continue
         log.forget_from(step)
         if step in ("features", "matches"):  # the models of finished attempts build on these
             (job.attempts / LOG_FILE).unlink(missing_ok=True)
         start, cpu = time.monotonic(), time.process_time()
-        result = actions[step]()
-        result["seconds"] = round(time.monotonic() - start, 2)
-        result["cpu_seconds"] = round(time.process_time() - cpu, 2)
+        found = actions[step]()
+        result = replace(found, seconds=round(time.monotonic() - start, 2),
+                         cpu_seconds=round(time.process_time() - cpu, 2))
         if step in ("features", "matches"):
             database.seal(job.database)
         folder = job.out / _FOLDERS[step] if step in _FOLDERS else None
@@ -107,7 +108,7 @@ def _prepare_database(
     """Keeps the database of an interrupted run where it is intact, else starts a new one."""
     sound = database.is_sound(job.database, job.names, len(job.groups))
     damaged = database.keep_sealed(job.database) if sound else "features"
-    if damaged and log.result(damaged) is not None:
+    if damaged and log.is_finished(damaged):
         report.tell(f"unfinished work is damaged: {damaged} are found anew")
     if damaged == "features":
         log.forget_from("features")
@@ -116,9 +117,9 @@ def _prepare_database(
         log.forget_from("matches")
         database.clear_matches(job.database)
     for step in ("features", "matches"):
-        result = log.result(step)
+        result = log.result(step, CountedResult)
         # Further attempts add pairs.
-        if result is not None and result["rows"] > database.progress(job.database, step):
+        if result is not None and result.rows > database.progress(job.database, step):
             log.forget_from(step)
 
 

@@ -7,24 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import FormatError, list_names
+from recon_cli.errors import FormatError, format_count, list_names
 from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.jobs.executor import Executor, start_executor
 from recon_cli.room.scale import parse_place
 from recon_cli.sfm import database, parts, process, segments
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
-from recon_cli.sfm.time_estimate import Workload, format_minutes, tell_seconds
+from recon_cli.sfm.results import MappingResult
+from recon_cli.sfm.time_estimate import Workload, estimate_for_notice, format_minutes
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import POSES, FrameList, describe_stretches, read_poses
-from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, SfmSummary
+from recon_cli.workspace.summaries import (
+    AttemptSummary,
+    PartSummary,
+    PosesSummary,
+    SfmSummary,
+)
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.
 MAX_MINUTES, USUAL_FRAMES, MINUTES_PER_FRAME = 20.0, 100, 0.2
-NEAR_LIMIT = 0.5  # share of the limit from which on it is told, too
+NEAR_LIMIT = 0.5  # share of the limit from which on the notice names the limit
 STRETCHES = 8  # of frames without a camera, in a sentence
 
 
@@ -66,9 +71,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         _tell_time(config, job, ctx)
     runs = segments.SegmentRuns(job, {}, {}) if mapped else _run_segments(config, job, ctx)
     job = runs.job
-    process.run_job(
-        job, progress=ctx.progress, record=ctx.record, on_idle=ctx.on_idle)
-    summary = _summary(frames, runs)
+    process.run_job(job, progress=ctx.progress, record=ctx.record, on_idle=ctx.on_idle)
+    summary = _summary(frames, runs, MappingResult.read(job))
     _report(summary, frames, ctx)
     segments.remove_segments(job)
     database.unseal(job.database)
@@ -78,18 +82,18 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
 def _run_segments(
     config: SfmConfig, job: MappingJob, ctx: StageContext
 ) -> segments.SegmentRuns:
-    """Maps a long capture in segments and tells which failed; leaves others as they are."""
-    whole = job.known_poses or job.pairs != "auto"
-    count = 1 if whole else segments.count_segments(
+    """Maps a long capture in segments and says which failed; leaves others as they are."""
+    together = job.known_poses or job.pairs != "auto"
+    number = 1 if together else segments.count_segments(
         segments.count_mapped(job), config.segments)
-    if count == 1:
+    if number == 1:
         segments.remove_segments(job)  # of a run with other options
         if config.on == "ray":
-            ctx.notice(f"The {len(job.names)} images are mapped as a whole, on this machine: only "
+            ctx.notice(f"The {len(job.names)} images are mapped together, on this machine: only "
                        "segments run on Ray (--segments).")
         return segments.SegmentRuns(job, {}, {})
     runs = segments.map_segments(
-        job, count, lambda count: _start_executor(config, job, count, ctx.threads),
+        job, number, lambda count: _start_executor(config, job, count, ctx.threads),
         progress=ctx.progress, record=ctx.record)
     for index, reason in runs.failed.items():
         names = runs.job.segments[index]
@@ -117,14 +121,14 @@ def _time_limit(config: SfmConfig, frames: FrameList) -> float:
 
 def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
     """Tells how long the cameras will take, and the limit where it is near."""
-    if job.known_poses or job.pairs != "auto" or StepLog(job.out).result("features") is not None:
+    if job.known_poses or job.pairs != "auto" or StepLog(job.out).is_finished("features"):
         return  # as asked for, or partly done
     mapped = segments.count_mapped(job)
-    count = segments.count_segments(mapped, config.segments)
+    number = segments.count_segments(mapped, config.segments)
     largest = max(job.groups, key=lambda group: len(group.names))
-    seconds = tell_seconds(Workload(
+    seconds = estimate_for_notice(Workload(
         len(job.names), largest.width * largest.height / 1e6, tracked=job.tracks is not None,
-        segments=count, keyframes=mapped), ctx.threads)
+        segments=number, keyframes=mapped), ctx.threads)
     if seconds is None:
         return
     near = seconds > NEAR_LIMIT * 60 * job.max_minutes
@@ -167,36 +171,32 @@ def _check_frames(job: MappingJob) -> None:
                 hint=f"Run `recon {verb} --again`.")
 
 
-def _summary(frames: FrameList, runs: segments.SegmentRuns) -> SfmSummary:
-    job = runs.job
-    results: dict[str, dict[str, Any]] = {}
-    for step in job.steps:
-        result = StepLog(job.out).result(step)
-        assert result is not None, f"the mapping process ended without {step}"
-        results[step] = result
-    model = results["model"]
-    part, finished = model["parts"][job.part - 1], model.get(parts.FINISHED, {})
-    unregistered = sorted({frame.name for frame in frames.frames} - set(part["registered"]))
+def _summary(frames: FrameList, runs: segments.SegmentRuns, found: MappingResult) -> SfmSummary:
+    job, model = runs.job, found.model
+    part, earlier = model.parts[job.part - 1], model.earlier
+    unregistered = tuple(sorted({frame.name for frame in frames.frames} - set(part.registered)))
     held_out = {frame.name for frame in frames.frames if frame.held_out}
-    return SfmSummary.from_json({
-        **model, **part, "frames": len(frames.frames), "registered": len(part["registered"]),
-        "part": job.part if len(model["parts"]) > 1 else None, "parts": [
-            {"names": each["registered"], "points": each["points"]} for each in model["parts"]],
-        "lines": [*model.get("broken", [])[:1], *part["lines"], *model["notes"]],
-        "unregistered": unregistered,
-        "unregistered_held_out": [name for name in unregistered if name in held_out],
-        "world": results["sparse"], "cameras": results["undistorted"]["cameras"],
-        "segments": finished.get("segments", max(1, len(job.segments))),
-        "seconds": {step: result["seconds"] for step, result in results.items()},
-        "cpu_seconds": {
+    return SfmSummary(
+        frames=len(frames.frames), registered=len(part.registered), points=part.points,
+        mean_track_length=part.mean_track_length, reprojection_error_px=part.reprojection_error_px,
+        median_triangulation_angle_deg=part.median_triangulation_angle_deg, poses=model.poses,
+        models=model.models, apart=model.apart, rejected=part.rejected, verdict=part.verdict,
+        lines=(*model.broken[:1], *part.lines, *model.notes), attempts=model.attempts,
+        seconds=found.seconds, unregistered=unregistered,
+        unregistered_held_out=tuple(name for name in unregistered if name in held_out),
+        world=found.world, cameras=found.cameras, left_out=model.left_out,
+        parts=tuple(PartSummary(names=each.registered, points=each.points)
+                    for each in model.parts),
+        part=job.part if len(model.parts) > 1 else None, broken=model.broken,
+        segments=earlier.segments if earlier else max(1, len(job.segments)),
+        cpu_seconds={
             **{f"{step} of segments": seconds for step, seconds in runs.cpu_seconds.items()},
-            **finished.get("cpu_seconds", {}),
-            **{step: result.get("cpu_seconds", 0.0) for step, result in results.items()}}})
+            **(earlier.cpu_seconds if earlier else {}), **found.cpu_seconds})
 
 
 def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
-    """Says what was tried, which frames have no camera and which models were left aside."""
-    for sentence in (*_attempts(summary.rungs), *summary.lines, *_movement(summary.poses),
+    """Says which mappers were tried, which frames have no camera and which models are not used."""
+    for sentence in (*_attempts(summary.attempts), *summary.lines, *_movement(summary.poses),
                      *_describe_parts(summary, frames), *_describe_left_out(summary, frames),
                      *summary.world.sentences):
         ctx.notice(sentence)
@@ -207,11 +207,12 @@ def _attempts(attempts: Sequence[AttemptSummary]) -> Iterator[str]:
     for attempt in attempts[1:]:
         reason = attempt.reason[:1].lower() + attempt.reason[1:].rstrip(".")  # may be a sentence
         if attempt.skipped:
-            yield (f"{attempt.name} was not tried although {reason}: {attempt.skipped}, more than "
-                   "is left of --max-minutes.")
+            yield (f"{attempt.name} was not tried (because {reason}): {attempt.skipped}, and "
+                   "--max-minutes leaves less.")
         else:
-            yield (f"{attempt.name} was tried, because {reason}: {attempt.registered} frames got a "
-                   f"camera{', and this model is kept' if attempt.kept else ''}.")
+            yield (f"{attempt.name} (tried because {reason}) registered "
+                   f"{format_count(attempt.registered, 'frame')}"
+                   f"{'; this model is used' if attempt.kept else ''}.")
 
 
 def _movement(poses: PosesSummary | None) -> Iterator[str]:
@@ -226,8 +227,8 @@ def _describe_parts(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
     """Yields sentences on the parts of a capture that has several, and on how to take another."""
     if len(summary.parts) < 2:
         return
-    yield (f"The capture has {len(summary.parts)} parts that can be trusted, each by itself; "
-           f"this is part {summary.part}, and the others are left out.")
+    yield (f"The capture has {len(summary.parts)} parts, each of which can be trusted by itself; "
+           f"part {summary.part} is used, and the others are left out.")
     for number, part in enumerate(summary.parts, 1):
         yield (f"Part {number} has {len(part.names)} of {summary.frames} frames: "
                f"{_stretches(frames, part.names)}.")
@@ -237,23 +238,25 @@ def _describe_parts(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
 
 
 def _describe_left_out(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
-    """Yields sentences on frames without a camera and on models that were left aside."""
+    """Yields sentences on frames without a camera and on models that are not used."""
     missing, held_out = summary.unregistered, summary.unregistered_held_out
     if summary.left_out:
-        yield (f"{len(summary.left_out)} frames are left out with the rest of the model: "
+        left_out = format_count(len(summary.left_out), "frame")
+        yield (f"Left out with the rest of the model: {left_out}, "
                f"{_stretches(frames, summary.left_out)}.")
     for name, reason in summary.rejected.items():
         yield f"{name} was taken out of the model: {reason}."
     if missing and not summary.lines:  # the verdict names them, and why
-        yield (f"{len(missing)} of {summary.frames} frames have no camera and are left out: "
+        yield (f"Left out without a camera: {len(missing)} of {summary.frames} frames, "
                f"{_stretches(frames, missing)}.")
     if held_out:
-        yield (f"{len(held_out)} frames without a camera were held out and so cannot be scored: "
+        yield (f"Held-out frames without a camera, which cannot be scored ({len(held_out)}): "
                f"{list_names(held_out)}.")
     if summary.apart:
         apart = "; ".join(
-            f"{len(names)} frames ({_stretches(frames, names)})" for names in summary.apart)
-        yield f"The capture fell apart: left aside are smaller models, of {apart}."
+            f"{format_count(len(names), 'frame')} ({_stretches(frames, names)})"
+            for names in summary.apart)
+        yield f"The capture split into disconnected models; the smaller ones are not used: {apart}."
 
 
 def _stretches(frames: FrameList, names: Collection[str]) -> str:

@@ -115,7 +115,7 @@ class Trust:
             splats, self.support, camera, sh_degree=self.sh_degree, backend=backend)
         return self.error.expect(picture.terms)
 
-    def to_json(self) -> dict[str, Any]:
+    def describe_pictures(self) -> dict[str, Any]:
         """Returns what a 16-bit picture of it means, for readers and as its fingerprint."""
         return {"unit": "expected mean absolute error of the channels, whole range = 1",
                 "error_per_step": 1 / FULL, "views": len(self.support.rows),

@@ -6,13 +6,14 @@ import dataclasses
 import os
 import shlex
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.digests import FileDigest, Source, digest_file, matches, sha256_json
+from recon_cli.workspace.json_record import KEY, JsonRecord
 
 NAME = "manifest.json"
 SCHEMA = 1
@@ -21,13 +22,14 @@ _MAX_REASONS = 3  # changes of one kind that are named; the rest is counted
 
 
 @dataclass(frozen=True)
-class ResultKey:
+class ResultKey(JsonRecord):
     """Everything that decides what comes out of a stage."""
 
     stage: str  # its name
     version: int  # of the stage's code
     config: Mapping[str, Any]  # the hashed options
-    sources: tuple[Source, ...]  # the user's own files, of ingest and import
+    # the user's own files, of ingest and import
+    sources: tuple[Source, ...] = field(metadata={KEY: "inputs"})
     # digest of what each earlier stage wrote; None where a stage is left out
     upstream: Mapping[str, str | None]
     # digest of the finished result of this stage that the run goes on from; None where it begins
@@ -38,43 +40,15 @@ class ResultKey:
     @property
     def fingerprint(self) -> str:
         """SHA-256 over all but the verb, which the rest implies; of sources the contents count."""
+        continues = {"continues": self.continues} if self.continues else {}
         return sha256_json({
             "stage": self.stage, "version": self.version, "config": self.config,
             "sources": [source.contents() for source in self.sources], "upstream": self.upstream,
-            **self._continues_json()})
-
-    def _continues_json(self) -> dict[str, str]:
-        return {"continues": self.continues} if self.continues else {}
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns plain values that `from_json` takes."""
-        return {
-            "stage": self.stage,
-            "version": self.version,
-            "config": dict(self.config),
-            "inputs": [dataclasses.asdict(source) for source in self.sources],
-            "upstream": dict(self.upstream), "verb": self.verb,
-            **self._continues_json()}
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> ResultKey:
-        """Returns the key that `to_json` described.
-
-        Raises:
-            KeyError, TypeError, ValueError, AttributeError: it is of no such form.
-        """
-        sources = tuple(
-            Source(_typed(item["path"], str), _digests(item["files"])) for item in value["inputs"])
-        upstream = {name: _typed(digest, str, type(None))
-                    for name, digest in value["upstream"].items()}
-        return cls(
-            _typed(value["stage"], str), _typed(value["version"], int),
-            _typed(value["config"], dict), sources, upstream,
-            _typed(value.get("continues"), str, type(None)), _typed(value.get("verb", ""), str))
+            **continues})
 
 
 @dataclass(frozen=True)
-class RunRecord:
+class RunRecord(JsonRecord):
     """How a result came about. Recorded for people, never hashed."""
 
     seconds: float  # of work, resumed runs added up
@@ -85,6 +59,12 @@ class RunRecord:
     backend: str | None  # rasterizer; None for stages that do not render
     threads: int  # CPU threads
     finished: str  # ISO 8601 with time zone
+
+
+@dataclass(frozen=True)
+class _Result(JsonRecord):
+    outputs: Mapping[str, FileDigest]
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -101,8 +81,7 @@ class Manifest:
         """Writes the manifest into a stage's folder, whole or not at all."""
         content = {
             "schema": SCHEMA, **self.key.to_json(), "fingerprint": self.key.fingerprint,
-            "outputs": {name: dataclasses.asdict(file) for name, file in self.outputs.items()},
-            "digest": self.digest, **dataclasses.asdict(self.run)}
+            **_Result(self.outputs, self.digest).to_json(), **self.run.to_json()}
         write_json(folder / NAME, {**content, "self": sha256_json(content)})
 
     @classmethod
@@ -119,31 +98,23 @@ class Manifest:
         try:
             content = read_json(path, dict)
             if content.get("schema") != SCHEMA:
-                raise ManifestError(
+                raise FormatError(
                     f"{path} has schema {str(content.get('schema'))[:20]}, but this recon reads "
-                    f"schema {SCHEMA}.", hint=hint)
+                    f"schema {SCHEMA}.")
             if content.pop("self", None) != sha256_json(content):
-                raise ManifestError(
-                    f"{path} does not match its own checksum: it was edited or damaged.", hint=hint)
-            return cls._of(content)
+                raise FormatError(
+                    f"{path} does not match its own checksum: it was edited or damaged.")
         except FormatError as error:
             raise ManifestError(error.message, hint=hint) from error
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+        try:
+            result = _Result.from_json(content)
+            for name in result.outputs:
+                _check_output(name)
+            return cls(ResultKey.from_json(content), result.outputs, result.digest,
+                       RunRecord.from_json(content))
+        except (ManifestError, ValueError, RecursionError) as error:
             raise ManifestError(
-                f"{path} is not a manifest of recon: {reason}.", hint=hint) from error
-
-    @classmethod
-    def _of(cls, content: Mapping[str, Any]) -> Manifest:
-        outputs = _digests(content["outputs"])
-        for name in outputs:
-            _check_output(name)
-        run = {field.name: content[field.name] for field in dataclasses.fields(RunRecord)}
-        _typed(run["seconds"], int, float)
-        _typed(run["summary"], dict)
-        _typed(run["versions"], dict)
-        return cls(ResultKey.from_json(content), outputs, _typed(content["digest"], str),
-                   RunRecord(**run))
+                f"{path} is not a manifest of recon: {error}.", hint=hint) from error
 
 
 def _check_output(name: str) -> None:
@@ -151,12 +122,19 @@ def _check_output(name: str) -> None:
     parts = name.split("/")
     if ("\0" in name or "\\" in name or ".." in parts or "" in parts or "." in parts
             or ":" in parts[0] or max(len(os.fsencode(part)) for part in parts) > _NAME_BYTES):
-        raise ValueError(f"it names the output {name[:100]!r}, which is no file of a stage")
+        raise ValueError(f"it names the output {name[:100]!r}, which is not a file of a stage")
 
 
 def describe_progress(done: int, total: int) -> str:
     """Returns how far a run came, in a few words; `total` is 0 before anything was saved."""
     return f"{done}/{total}" if total else "just begun"
+
+
+@dataclass(frozen=True)
+class _Progress(JsonRecord):
+    done: int
+    total: int
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -172,7 +150,7 @@ class PartialRun:
         """Writes the record, whole or not at all."""
         content = {
             "fingerprint": self.key.fingerprint, **self.key.to_json(),
-            "done": self.done, "total": self.total, "seconds": self.seconds}
+            **_Progress(self.done, self.total, self.seconds).to_json()}
         write_json(path, {**content, "self": sha256_json(content)})
 
     @classmethod
@@ -182,10 +160,9 @@ class PartialRun:
             value = read_json(path, dict)
             if value.pop("self", None) != sha256_json(value):
                 return None
-            return cls(
-                ResultKey.from_json(value), _typed(value["done"], int), _typed(value["total"], int),
-                _typed(value["seconds"], int, float))
-        except (FormatError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
+            progress = _Progress.from_json(value)
+            return cls(ResultKey.from_json(value), **dataclasses.asdict(progress))
+        except (FormatError, ManifestError, RecursionError):
             return None
 
 
@@ -268,17 +245,3 @@ def _value_text(value: object) -> str:
     if value is None:
         return "automatic"
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _digests(value: Mapping[str, Mapping[str, Any]]) -> dict[str, FileDigest]:
-    return {name: FileDigest(
-        _typed(file["sha256"], str), _typed(file["size"], int), _typed(file["mtime_ns"], int))
-        for name, file in value.items()}
-
-
-def _typed(value: Any, *kinds: type) -> Any:
-    """Returns a value, or raises TypeError unless it is of one of these types."""
-    if type(value) not in kinds:
-        raise TypeError(f"it holds {str(value)[:100]!r}, not a value of type "
-                        f"{' or '.join(kind.__name__ for kind in kinds)}")
-    return value

@@ -12,17 +12,16 @@ import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from recon_cli.errors import FormatError, ReconError
+from recon_cli.errors import FormatError, ManifestError
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace import atomic
-from recon_cli.workspace.summaries import JsonRecord
+from recon_cli.workspace.json_record import JsonRecord
 
 FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = "Run `recon ingest --again`."
@@ -57,7 +56,7 @@ class Group(JsonRecord):
 
 
 @dataclass(frozen=True)
-class FrameList:
+class FrameList(JsonRecord):
     """The content of frames.json."""
 
     # kind of the capture: "video", "photos", "mixed", or the layout of a data set with poses
@@ -74,18 +73,18 @@ def read_frame_list(stage: Path) -> FrameList:
     """Returns the list of frames in ingest's folder; FormatError if it is missing or damaged."""
     value = atomic.read_json(stage / LIST, dict, hint=AGAIN)
     try:
-        frames = tuple(Frame.from_json(frame) for frame in value["frames"])
-        groups = tuple(_group(group) for group in value["groups"])
-        source = value["source"]
-    except (AttributeError, KeyError, TypeError, ValueError, ReconError) as error:
+        found = FrameList.from_json(value)
+    except ManifestError as error:
         raise FormatError(f"{stage / LIST} is not a list of frames.", hint=AGAIN) from error
-    if not isinstance(source, str) or not groups or not all(
-            0 <= frame.group < len(groups) and Path(frame.name).name == frame.name
-            for frame in frames):
+    for lens in (group.lens for group in found.groups if group.lens is not None):
+        make_lens(lens.model, lens.width, lens.height, lens.params, "the list of frames")
+    if not found.groups or not all(
+            0 <= frame.group < len(found.groups) and Path(frame.name).name == frame.name
+            for frame in found.frames):
         raise FormatError(
             f"{stage / LIST} is damaged: it names files elsewhere, or groups that are missing.",
             hint=AGAIN)
-    return FrameList(source, groups, frames)
+    return found
 
 
 def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[str]:
@@ -109,14 +108,6 @@ def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[
             text += f" ({seconds} s{f' of {video}' if len(videos) > 1 else ''})"
         stretches.append(text)
     return stretches
-
-
-def _group(value: dict[str, Any]) -> Group:
-    lens, group = value["lens"], Group.from_json({**value, "lens": None})
-    if lens is None:
-        return group
-    return dataclasses.replace(group, lens=make_lens(
-        lens["model"], lens["width"], lens["height"], lens["params"], "the list of frames"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +147,7 @@ def read_poses(path: Path) -> KnownPoses:
         return KnownPoses(viewmats, bool(value["metric"]), tensors["points"], tensors["colors"])
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError, OSError,
             SafetensorError) as error:
-        raise FormatError(f"{path} holds no poses.", hint=AGAIN) from error
+        raise FormatError(f"{path} does not hold poses.", hint=AGAIN) from error
 
 
 def choose_held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:

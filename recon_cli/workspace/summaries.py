@@ -1,103 +1,21 @@
 """Typed records between stages: what a stage returns, and the JSON files that others read.
 
 The pipeline stores a stage's record as `summary` in its manifest; later stages read it by
-`from_json`. Fields are the JSON keys, in order; one whose default is None is left out while it is
-None.
+`from_json`, see `json_record`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import types
 import typing
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from recon_cli.errors import FormatError, ManifestError, ReconError
+from recon_cli.errors import FormatError
 from recon_cli.workspace.atomic import parse_json, read_json, read_text
-
-_HINT = "Run the stage that wrote it again with --again."
-_SCALARS: Mapping[Any, tuple[type, ...]] = {
-    bool: (bool,), int: (int,), float: (float, int), str: (str,)}
-
-
-@dataclass(frozen=True)
-class JsonRecord:
-    """A frozen dataclass of JSON values, tuples of them and other such records."""
-
-    def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG002
-        """Returns why `options` that take no part in the fingerprint would give another result."""
-        return ()
-
-    def not_recorded(self) -> tuple[str, ...]:
-        """Returns the files in the folder of the result that are not of the stage's making."""
-        return ()
-
-    def failure(self) -> ReconError | None:
-        """Returns what the user asked for and did not get, though the result is worth keeping."""
-        return None
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns JSON values that `from_json` reads; tuples become lists."""
-        value = {}
-        for field in dataclasses.fields(self):
-            item = getattr(self, field.name)
-            if item is not None or field.default is not None:
-                value[field.name] = _encode(item)
-        return value
-
-    @classmethod
-    def from_json(cls, value: Any) -> Self:
-        """Returns the record that `to_json` wrote; unknown keys are ignored.
-
-        Raises:
-            ManifestError: it is no mapping, lacks a field, or holds one of another type.
-        """
-        if not isinstance(value, Mapping):
-            raise ManifestError("the record is not a JSON object", hint=_HINT)
-        kinds = typing.get_type_hints(cls)
-        fields = dataclasses.fields(cls)
-        missing = [
-            field.name for field in fields if field.name not in value
-            and field.default is dataclasses.MISSING
-            and field.default_factory is dataclasses.MISSING]
-        if missing:
-            raise ManifestError(
-                f"the record lacks {', '.join(missing)}: another version of recon wrote it",
-                hint=_HINT)
-        return cls(**{
-            field.name: _decode(field.name, kinds[field.name], value[field.name])
-            for field in fields if field.name in value})
-
-
-def _encode(item: Any) -> Any:
-    if isinstance(item, JsonRecord):
-        return item.to_json()
-    if isinstance(item, (tuple, list)):
-        return [_encode(part) for part in item]
-    if isinstance(item, Mapping):
-        return {key: _encode(part) for key, part in item.items()}
-    return item
-
-
-def _decode(name: str, kind: Any, item: Any) -> Any:
-    """Returns a JSON value as the type that the field `name` is annotated with."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (types.UnionType, typing.Union):  # X | None
-        return None if item is None else _decode(name, arguments[0], item)
-    if origin is tuple and isinstance(item, (list, tuple)):
-        return tuple(_decode(name, arguments[0], part) for part in item)
-    if origin is Mapping and isinstance(item, Mapping):
-        return {key: _decode(name, arguments[1], part) for key, part in item.items()}
-    if isinstance(kind, type) and issubclass(kind, JsonRecord):
-        return kind.from_json(item)
-    if kind is Any or isinstance(item, _SCALARS.get(kind, ())):
-        return item
-    raise ManifestError(
-        f"the record holds {repr(item)[:100]} as {name}: another version of recon wrote it",
-        hint=_HINT)
+from recon_cli.workspace.json_record import KEY
+from recon_cli.workspace.json_record import JsonRecord as JsonRecord  # whoever reads a record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +145,7 @@ class SfmSummary(JsonRecord):
     rejected: Mapping[str, str]  # why frames were taken out of the model, by name
     verdict: Mapping[str, Any] | None  # `sfm.verdict.Verdict`; None for poses not examined
     lines: tuple[str, ...]  # the verdict in words
-    rungs: tuple[AttemptSummary, ...]
+    attempts: tuple[AttemptSummary, ...] = field(metadata={KEY: "rungs"})
     seconds: Mapping[str, float]  # by step
     unregistered: tuple[str, ...]  # names of the frames without a camera
     unregistered_held_out: tuple[str, ...]  # those of them that are held out
@@ -250,7 +168,8 @@ class SfmSummary(JsonRecord):
         reasons = ["it keeps a part of a broken model"] * (cut and forbids)
         asked = str(options.get("segments", "auto"))
         if asked != "auto" and self.segments != (1 if asked == "off" else int(asked)):
-            reasons.append(f"it was mapped in {self.segments} segments")
+            reasons.append("it was mapped without segments" if self.segments == 1 else
+                           f"it was mapped in {self.segments} segments")
         return tuple(reasons)
 
     @property

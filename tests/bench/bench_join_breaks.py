@@ -27,14 +27,12 @@ from scipy.spatial.transform import Rotation
 from workbench import FOLDER
 
 from recon_cli.sfm.join_segments import MODEL_FOLDER
+from recon_cli.sfm.limits import MAX_POINT_ERROR
 from recon_cli.sfm.segment_joins import (
-    MAX_ERROR,
-    SegmentCameras,
-    SharedPoints,
     camera_residuals,
     judge_join,
 )
-from recon_cli.sfm.segment_points import Segment, describe_segment
+from recon_cli.sfm.shared_points import Segment, SegmentCameras, SharedPoints, describe_segment
 
 BREAKS = {"as it is": (1.0, 0.0), "x 0.8": (0.8, 0.0), "x 0.9": (0.9, 0.0), "x 1.1": (1.1, 0.0),
           "x 1.25": (1.25, 0.0), "x 1.5": (1.5, 0.0), "5 degrees": (1.0, 5.0),
@@ -99,7 +97,7 @@ def main(folders: Sequence[Path]) -> None:
                         continue
                     off = np.linalg.norm(join.motion.points(points.ours) - points.theirs, axis=1)
                     rows[name].append((
-                        float(join.holds), float((off <= MAX_ERROR * cameras.depth).mean()),
+                        float(join.holds), float((off <= MAX_POINT_ERROR * cameras.depth).mean()),
                         *camera_residuals(join.motion, first.cameras, cameras)))
     click.echo("| second segment | joins | accepted | points that agree | cameras off | degrees |\n"
                "|---|---:|---:|---:|---:|---:|")

@@ -36,7 +36,7 @@ from workbench import FOLDER, print_head, print_row
 from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import build_posed_model, drop_outliers
-from recon_cli.sfm.scale_drift import MAX_ERROR, find_weakest_scale
+from recon_cli.sfm.scale_drift import MAX_SCALE_ERROR, find_weakest_scale
 from recon_cli.sfm.verdict import ModelVerdict, examine
 
 FACTORS = (1.03, 1.10, 1.25)
@@ -71,7 +71,7 @@ class Row:
     ) -> Row:
         """The row of a model."""
         error = 0.0 if verdict.scale is None else verdict.scale.error
-        by_scale = not verdict.open_loops and error > MAX_ERROR
+        by_scale = not verdict.open_loops and error > MAX_SCALE_ERROR
         return cls(capture, made, cameras, left, label, error, len(verdict.open_loops),
                    verdict.trusted, len(verdict.problems) > by_scale)
 
@@ -84,7 +84,7 @@ class Row:
         """Its cells of the table."""
         return (self.capture, self.made, self.cameras, f"{self.left:.3f}", f"{self.error:.3f}",
                  str(self.loops), self.label or "-", "trusted" if self.trusted else "refused",
-                 "WRONG" if self.is_wrong(MAX_ERROR) else "")
+                 "WRONG" if self.is_wrong(MAX_SCALE_ERROR) else "")
 
 
 def relative_scale(before: Array, after: Array, place: int) -> float:
@@ -227,7 +227,7 @@ def held_out(rows: Sequence[Row]) -> Iterator[str]:
         others = [row for row in rows if row.capture not in kept and not row.otherwise]
         most = max((row.error for row in others if row.label == "good"), default=0.0)
         least = min((row.error for row in others if row.label == "broken" and row.error > most),
-                    default=2 * MAX_ERROR)
+                    default=2 * MAX_SCALE_ERROR)
         bound = (most + least) / 2
         own = [row for row in rows if row.capture in kept and row.label]
         wrong = [f"{row.capture} {row.made}" for row in own if row.is_wrong(bound)]
@@ -256,7 +256,7 @@ def main(data: Path, out: Path, names: tuple[str, ...], walk: tuple[tuple[Path, 
                 print_row(*row.cells())
     for label in ("good", "broken"):
         own = [row for row in rows if row.label == label]
-        wrong = sum(row.is_wrong(MAX_ERROR) for row in own)
+        wrong = sum(row.is_wrong(MAX_SCALE_ERROR) for row in own)
         click.echo(f"{label}: {len(own)} models, {wrong} decided wrongly")
     for line in held_out(rows):
         click.echo(line)

@@ -66,7 +66,7 @@ def read_row(workspace: Path) -> Row | None:
         summary = SfmSummary.from_json(manifest["summary"])
     except (OSError, FormatError, ManifestError):  # unfinished, or of another version
         return None
-    if summary.poses or not summary.cpu_seconds or not summary.rungs:
+    if summary.poses or not summary.cpu_seconds or not summary.attempts:
         return None
     group = max(frames.groups, key=lambda each: each.width * each.height)
     tracks = workspace / "ingest" / TRACKS
@@ -76,7 +76,7 @@ def read_row(workspace: Path) -> Row | None:
         keyframes=len(choose_keyframes(Tracks.read(tracks))) if tracks.exists() else None)
     return Row(
         workspace.name, work, sum(summary.cpu_seconds.values()), manifest["seconds"],
-        tuple(rung.name for rung in summary.rungs[1:] if not rung.skipped))
+        tuple(attempt.name for attempt in summary.attempts[1:] if not attempt.skipped))
 
 
 def fit(rows: list[Row]) -> Costs:

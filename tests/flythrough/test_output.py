@@ -95,9 +95,9 @@ def test_a_step_is_a_millimetre_in_metres_and_else_a_thousandth_of_the_extent():
     assert there.extent == pytest.approx(2.2)
     known, unknown = depth_scale(there, metres=True), depth_scale(there, metres=False)
     assert (known.step, unknown.step) == (1e-3, pytest.approx(2.2e-3))
-    assert known.to_json()["unit"] == "millimetre"
-    assert unknown.to_json()["unit"] == "thousandth of the scene's extent"
-    assert unknown.to_json()["world_units_per_step"] == unknown.step
+    assert known.describe_pictures()["unit"] == "millimetre"
+    assert unknown.describe_pictures()["unit"] == "thousandth of the scene's extent"
+    assert unknown.describe_pictures()["world_units_per_step"] == unknown.step
     assert 1 <= known.near < 2 < known.far <= 6
 
 

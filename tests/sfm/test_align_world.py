@@ -15,7 +15,7 @@ from recon_cli.errors import ConfigError
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.align_world import WorldFrame, world_transform
-from recon_cli.sfm.undistort import move_model
+from recon_cli.sfm.shared_points import to_sim3d
 
 
 def world_of(room, *, gravity=True, between=None, metric=False) -> WorldFrame:
@@ -175,7 +175,7 @@ def test_every_observation_keeps_its_error_and_the_model_can_be_saved(tmp_path):
     before = residuals(model)
     centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     points = {i: point.xyz.copy() for i, point in model.points3D.items()}
-    move_model(model, similarity)
+    model.transform(to_sim3d(similarity))
     assert np.abs(before).max() > 0.1
     assert np.allclose(residuals(model), before, rtol=0, atol=1e-8)
     for i, center in centers.items():

@@ -3,7 +3,8 @@ import pycolmap
 import pytest
 from made_model import FOCAL, HEIGHT, WIDTH, MadeModel, along, wall
 
-from recon_cli.sfm.evidence import MAX_ERROR, OFFSETS, explained_matches, gather_evidence
+from recon_cli.sfm.evidence import OFFSETS, explained_matches, gather_evidence
+from recon_cli.sfm.limits import MAX_ERROR_PX
 
 
 def made(**changes) -> MadeModel:
@@ -50,7 +51,7 @@ def test_a_match_is_explained_at_no_depth_behind_the_cameras_or_too_near():
     assert explained.tolist() == [True, True, True, True, False]
 
 
-@pytest.mark.parametrize(("pixels", "agree"), [(MAX_ERROR - 1, True), (MAX_ERROR + 3, False)])
+@pytest.mark.parametrize(("pixels", "agree"), [(MAX_ERROR_PX - 1, True), (MAX_ERROR_PX + 3, False)])
 def test_a_match_agrees_up_to_the_error_at_which_it_was_accepted(pixels, agree, tmp_path):
     """A camera is turned up by an angle that shifts the middle of its image by so many pixels.
 

@@ -120,10 +120,9 @@ def test_a_good_model_falls_short_of_nothing(capture):
 def test_each_shortfall_is_said(capture):
     names = capture[0].names
     assert MapperAttempt("exhaustive", "").shortfall == "no model was found"
-    assert shortfall(candidate(capture, 17), names) == (
-        "only 17 of 20 frames that can be placed got a camera")
-    assert shortfall(candidate(capture, 18, apart=(("a", "b", names[19]),)), names) == (
-        "the capture fell into 2 models")
+    assert_facts(shortfall(candidate(capture, 17), names), 17, 20, "frames")
+    apart = candidate(capture, 18, apart=(("a", "b", names[19]),))
+    assert_facts(shortfall(apart, names), 2, "disconnected models")
     broken = Opinion(trusted=False, problems=("The model is broken.",))
     assert shortfall(candidate(capture, opinion=broken), names) == "The model is broken."
 
@@ -182,19 +181,19 @@ def test_where_no_mapper_found_a_model_none_is_best():
 def test_a_good_capture_stops_at_the_first_attempt(capture):
     job, truth = capture
     result = build(job)
-    attempt, = result["rungs"]
-    assert attempt["name"] == "exhaustive"
-    assert attempt["reason"] == "20 frames are few enough to match all pairs"
-    assert attempt["registered"] == 20
-    assert attempt["kept"]
-    part, = result["parts"]
-    assert part["registered"] == list(job.names)
-    assert result["models"] == [20]
+    attempt, = result.attempts
+    assert attempt.name == "exhaustive"
+    assert_facts(attempt.reason, 20, "frames")
+    assert attempt.registered == 20
+    assert attempt.kept
+    part, = result.parts
+    assert part.registered == job.names
+    assert result.models == (20,)
     assert not job.attempts.exists()
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
     assert json.loads((job.model / "verdict.json").read_text()) == json.loads(
-        json.dumps(part["verdict"]))
-    assert json.loads(json.dumps(result, allow_nan=False))
+        json.dumps(part.verdict))
+    assert json.dumps(result.to_json(), allow_nan=False)
 
 
 def nothing(*_, **__):
@@ -206,10 +205,9 @@ def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
     monkeypatch.setattr(mapper, "map_relaxed", nothing)
     result = build(job)
-    assert [(item["name"], item["reason"], item["kept"]) for item in result["rungs"]] == [
-        ("exhaustive", "20 frames are few enough to match all pairs", False),
-        ("relaxed", "no model was found", False),
-        ("global", "no model was found", True)]
+    assert [(item.name, item.kept) for item in result.attempts] == [
+        ("exhaustive", False), ("relaxed", False), ("global", True)]
+    assert [item.reason for item in result.attempts[1:]] == ["no model was found"] * 2
 
 
 def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
@@ -231,9 +229,8 @@ def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypa
     monkeypatch.setattr(fallbacks.merge_models, "merge", lambda *_: None)
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "")
     result = build(job)
-    assert sorted(each["registered"] for each in result["parts"]) == [
-        list(job.names[:10]), list(job.names[10:])]
-    assert result["apart"] == []
+    assert sorted(each.registered for each in result.parts) == [job.names[:10], job.names[10:]]
+    assert result.apart == ()
     assert sorted(path.name for path in job.parts.iterdir()) == ["1", "2"]
 
 
@@ -252,8 +249,8 @@ def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "the model cannot be trusted")
     result = build(job, deadline=0.0)
-    assert [bool(attempt["skipped"]) for attempt in result["rungs"]] == [False, True, True]
-    assert result["parts"][0]["registered"] == list(job.names)
+    assert [bool(attempt.skipped) for attempt in result.attempts] == [False, True, True]
+    assert result.parts[0].registered == job.names
 
 
 def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, monkeypatch):
@@ -263,12 +260,12 @@ def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, m
     monkeypatch.setattr(mapper, "map_globally", interrupt)
     with pytest.raises(KeyboardInterrupt):
         build(job)
-    assert StepLog(job.attempts).result("relaxed") is not None
+    assert StepLog(job.attempts).is_finished("relaxed")
     monkeypatch.undo()
     monkeypatch.setattr(mapper, "map_incrementally", interrupt)
     result = build(job)
-    assert [attempt["name"] for attempt in result["rungs"]] == ["exhaustive", "relaxed", "global"]
-    assert result["rungs"][2]["kept"]
+    assert [attempt.name for attempt in result.attempts] == ["exhaustive", "relaxed", "global"]
+    assert result.attempts[2].kept
 
 
 @pytest.mark.parametrize("place", ["match", "models", "model", "note", "verdict", "publish"])
@@ -287,7 +284,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
         build(job)
     assert not (job.model).exists()
     monkeypatch.undo()
-    assert build(job)["parts"][0]["registered"] == list(job.names)
+    assert build(job).parts[0].registered == job.names
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
 
 
@@ -306,5 +303,5 @@ def test_a_video_is_not_mapped_as_a_whole_after_its_segments(tmp_path, video):
                   tracks=tracks if video else None)
     first, *others = list_fallbacks(job)
     assert first.name == "segments"
-    assert first.reason == "300 frames were mapped in 2 segments"
+    assert_facts(first.reason, 300, "2 segments")
     assert bool(others) != video

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_model import MadeModel, along, wall
 
-from recon_cli.sfm.floor_heights import MAX_STEP, SPREAD, compare_heights, measure_heights
+from recon_cli.sfm.floor_heights import MAX_LOG_STEP, SPREAD, compare_heights, measure_heights
 from recon_cli.sfm.scale_drift import _ask_floor
 
 HEIGHT = 1.6  # of the cameras, whose y axis points down
@@ -30,7 +30,7 @@ def test_the_height_is_that_over_the_floor_and_unknown_without_one():
 def test_two_sides_are_compared_by_their_middle_heights():
     heights = np.repeat([1.5, 2.0], 30)
     assert compare_heights(heights, 30) == pytest.approx(np.log(2.0 / 1.5))
-    assert compare_heights(np.repeat([1.5, 1.5 * np.exp(MAX_STEP + 0.01)], 30), 30) is None
+    assert compare_heights(np.repeat([1.5, 1.5 * np.exp(MAX_LOG_STEP + 0.01)], 30), 30) is None
     assert compare_heights(np.where(np.arange(60) < 5, 1.5, np.nan), 30) is None
 
 

@@ -24,6 +24,7 @@ from recon_cli.sfm.job import (
     publish,
     vouch,
 )
+from recon_cli.sfm.results import CountedResult, SplitResult
 
 
 def job(count, pairs="auto"):
@@ -57,7 +58,7 @@ def test_a_job_with_values_of_other_types_is_none(tmp_path, name, value):
     job(4).write(path)
     fields = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps({**fields, name: value}), encoding="utf-8")
-    with pytest.raises(FormatError, match="no mapping job"):
+    with pytest.raises(FormatError, match="not a mapping job"):
         MappingJob.read(path)
 
 
@@ -92,22 +93,26 @@ def finished(tmp_path):
     """A folder in which all steps are finished."""
     ledger = StepLog(tmp_path)
     for step in ("features", "matches"):
-        ledger.finish(step, {"rows": 3})
+        ledger.finish(step, CountedResult(rows=3))
     for step in ("model", "sparse", "undistorted"):
         (tmp_path / step / "images").mkdir(parents=True)
         (tmp_path / step / "images" / "a.bin").write_bytes(b"12345")
-        ledger.finish(step, {"points": 7}, tmp_path / step)
+        ledger.finish(step, SplitResult(segments=((step,),)), tmp_path / step)
     return tmp_path
 
 
 def done(folder):
     ledger = StepLog(folder)
-    return [step for step in STEPS if ledger.result(step) is not None]
+    return [step for step in STEPS if ledger.is_finished(step)]
 
 
 def test_results_are_read_back_by_the_next_process(finished):
-    assert StepLog(finished).result("features") == {"rows": 3}
-    assert StepLog(finished).result("undistorted") == {"points": 7}
+    assert StepLog(finished).result("features", CountedResult) == CountedResult(rows=3)
+    assert StepLog(finished).result("undistorted", SplitResult).segments == (("undistorted",),)
+
+
+def test_a_result_of_another_version_is_as_good_as_none(finished):
+    assert StepLog(finished).result("features", SplitResult) is None
 
 
 def test_an_empty_folder_has_nothing_finished(tmp_path):
@@ -142,7 +147,7 @@ def test_a_flipped_byte_is_found_before_a_step_is_believed(finished):
 
 def test_a_file_that_a_step_writes_besides_its_folder_is_looked_at_too(tmp_path):
     (tmp_path / "verdict.json").write_text("{}")
-    StepLog(tmp_path).finish("model", {"points": 7}, also=("verdict.json", "none.json"))
+    StepLog(tmp_path).finish("model", CountedResult(rows=7), also=("verdict.json", "none.json"))
     assert StepLog(tmp_path).find_damage() is None
     (tmp_path / "verdict.json").write_text("[]")
     assert StepLog(tmp_path).find_damage() == "model"
@@ -150,7 +155,7 @@ def test_a_file_that_a_step_writes_besides_its_folder_is_looked_at_too(tmp_path)
 
 def test_a_note_with_a_changed_figure_proves_nothing(finished):
     text = (finished / LOG_FILE).read_text()
-    (finished / LOG_FILE).write_text(text.replace('"points": 7', '"points": 8', 1))
+    (finished / LOG_FILE).write_text(text.replace('"rows": 3', '"rows": 4', 1))
     assert done(finished) == []
 
 

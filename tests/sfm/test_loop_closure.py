@@ -5,9 +5,9 @@ import pytest
 from made_model import FOCAL, MadeModel, along, wall
 
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm import skeleton
+from recon_cli.sfm import matching
 from recon_cli.sfm.loop_closure import bend_model, bend_segments, move_frames
-from recon_cli.sfm.segment_points import describe_segment, find_shared_points
+from recon_cli.sfm.shared_points import describe_segment, find_shared_points
 from recon_cli.sfm.stiffness import SCALES, measure_stiffness
 
 TURN = 24  # the frame from which on the walk comes back
@@ -51,7 +51,7 @@ def made():
 
 
 def matches_of(made, folder):
-    return skeleton.read_verified(made.write_database(folder / "database.db"))
+    return matching.read_verified(made.write_database(folder / "database.db"))
 
 
 def test_a_model_that_is_right_is_left_as_it_is(made, tmp_path):

@@ -32,25 +32,10 @@ def test_two_parts_of_a_capture_become_one(capture, first):
 
 def test_the_similarity_between_two_parts_is_found_from_their_points(capture):
     job, truth = capture
-    base = part(truth, job.names[:12])
-    shared = merge_models.find_shared_points(
-        job.database, part(truth, job.names[12:], motion=moved()), base)
-    assert len(shared[0]) == 300
-    estimate = merge_models.similarity(*shared, base, seed=0)
-    np.testing.assert_allclose(estimate.matrix(), moved().inverse().matrix(), atol=1e-6)
-
-
-def test_points_that_contradict_each_other_give_no_similarity(capture):
-    _, truth = capture
-    noise = np.random.default_rng(0)
-    shared = noise.normal(size=(200, 3)), noise.normal(size=(200, 3))
-    assert merge_models.similarity(*shared, truth, seed=0) is None
-
-
-def test_too_few_shared_points_give_no_similarity(capture):
-    _, truth = capture
-    few = np.random.default_rng(0).normal(size=(merge_models.MIN_INLIERS - 1, 3))
-    assert merge_models.similarity(few, few, truth, seed=0) is None
+    found = merge_models.find_similarity(
+        job, part(truth, job.names[12:], motion=moved()), part(truth, job.names[:12]))
+    np.testing.assert_allclose(
+        found.matrix[:3], moved().inverse().matrix(), atol=1e-6)
 
 
 def test_a_part_that_brings_less_than_three_images_is_left_alone(capture):
@@ -101,7 +86,7 @@ def test_parts_that_fit_become_one_model_and_nothing_is_apart(fresh_capture):
 
 def test_parts_that_cannot_be_put_together_are_named(fresh_capture, monkeypatch):
     job, truth = fresh_capture
-    monkeypatch.setattr(merge_models, "similarity", lambda *_, **__: None)
+    monkeypatch.setattr(merge_models, "find_similarity", lambda *_: None)
     found = merge_models.best_model(job, [
         part(truth, job.names[12:16]), part(truth, job.names[:12]), part(truth, job.names[10:13]),
         part(truth, job.names[14:])])
@@ -145,7 +130,7 @@ def astray(truth, name):
 
 def test_where_many_cameras_are_suspected_the_model_is_left_as_it_is(fresh_capture, monkeypatch):
     job, truth = fresh_capture
-    suspects = tuple(OutlierCamera(name, 0.1, 200) for name in job.names[:5])
+    suspects = tuple(OutlierCamera(name, 0.1, 200, "", None) for name in job.names[:5])
     say(monkeypatch, lambda _: Opinion(trusted=False, outliers=suspects))
     found = merge_models.best_model(job, [pycolmap.Reconstruction(truth)])
     assert found.model.num_reg_images() == 20

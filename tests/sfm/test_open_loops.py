@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recon_cli.sfm.evidence import MatchEvidence
-from recon_cli.sfm.open_loops import MIN_POINTS, find_open_loops
+from recon_cli.sfm.limits import MIN_POSE_INLIERS
+from recon_cli.sfm.open_loops import find_open_loops
 
 COUNT = 40  # images on a ring, of which the last ones see again what the first ones saw
 NAMES = tuple(f"{index:06d}.png" for index in range(COUNT))
@@ -73,7 +74,7 @@ def test_matches_that_agree_on_nothing_are_no_loop():
 
 def test_few_points_one_image_or_an_unknown_order_say_nothing():
     copies = drifted(1.37, 0.0, 0.5)
-    assert find_open_loops(made(copies, points=MIN_POINTS - 2), ORDER) == ()
+    assert find_open_loops(made(copies, points=MIN_POSE_INLIERS - 2), ORDER) == ()
     assert find_open_loops(made(copies, pairs=((0, 36), (0, 37), (0, 38))), ORDER) == ()
     assert find_open_loops(made(copies), None) == ()
 

@@ -9,10 +9,10 @@ import pytest
 from made_model import FOCAL, HEIGHT, WIDTH, MadeModel, along, wall
 from scipy.spatial.transform import Rotation
 
+from recon_cli.sfm.limits import LOSS_SCALE
 from recon_cli.sfm.scale_drift import (
-    LEAST,
-    LOSS_SCALE,
-    MAX_ERROR,
+    LEAST_CAMERAS,
+    MAX_SCALE_ERROR,
     SHARED_ERRORS,
     find_weakest_scale,
     is_scale_known,
@@ -54,14 +54,14 @@ def weakest(made: MadeModel, **options):
 
 def test_what_both_halves_see_near_by_ties_their_scales():
     cut = weakest(halves(near(300)))
-    assert cut.error < MAX_ERROR
+    assert cut.error < MAX_SCALE_ERROR
     assert is_scale_known(cut)
 
 
 def test_where_only_the_distance_is_seen_from_both_halves_their_scale_is_unknown():
     made = halves(far(60))
     cut = weakest(made)
-    assert cut.error > MAX_ERROR
+    assert cut.error > MAX_SCALE_ERROR
     assert not is_scale_known(cut)
     assert abs(made.names.index(cut.after) - 12) <= 2, "the halves meet at frame 12"
     assert sorted(cut.sides[0] + cut.sides[1]) == made.names
@@ -74,7 +74,7 @@ def test_the_cut_is_searched_between_two_images_where_they_are_named():
 
 
 def test_a_walk_that_is_short_or_stands_still_tells_nothing():
-    short = NoisyModel(wall(-3, 8, count=300), along(np.arange(2 * LEAST - 1) * 0.5))
+    short = NoisyModel(wall(-3, 8, count=300), along(np.arange(2 * LEAST_CAMERAS - 1) * 0.5))
     assert weakest(short) is None
     still = NoisyModel(wall(-3, 3, count=300), along(np.arange(24) * 0.01))
     assert weakest(still) is None

@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.segment_joins import (
-    SegmentCameras,
-    SharedPoints,
     camera_residuals,
     judge_join,
     place_segments,
 )
+from recon_cli.sfm.shared_points import SegmentCameras, SharedPoints
 
 DEPTH = 3.0
 EXACT = 1e-6
@@ -228,4 +227,4 @@ def test_a_loop_that_is_none_is_refused_and_moves_nothing(chain):
     assert wrong.holds  # it agrees with itself
     group, = place_segments(cameras, [chain.judge(0, 1), chain.judge(1, 2), wrong])
     assert_same(group.motions[2], SECOND.inverse())
-    assert any("the loop between segments 0 and 2" in text for text in group.refused)
+    assert any("loop of segments 0 and 2" in text for text in group.refused)

@@ -15,6 +15,7 @@ from recon_cli.progress import NullProgress
 from recon_cli.sfm import segments
 from recon_cli.sfm.job import SPLIT, CameraGroup, MappingJob, StepLog
 from recon_cli.sfm.process import CrashError
+from recon_cli.sfm.results import SplitResult, StepResult
 
 
 def names_of(count):
@@ -41,7 +42,7 @@ def test_segments_of_a_video_cover_every_frame_and_overlap_as_asked(frames, coun
     assert len(parts) == count
     assert set().union(*parts) == set(names)
     common = segments.overlap(frames, count)
-    assert 0 < common <= segments.OVERLAP
+    assert 0 < common <= segments.SEGMENT_OVERLAP
     for before, after in itertools.pairwise(parts):
         assert before[-common:] == after[:common]
     for first, third in zip(parts, parts[2:], strict=False):
@@ -77,14 +78,14 @@ class Mapper:
     def __call__(self, job, *, record, **_):
         self.jobs.append(job)
         log = StepLog(job.out)
-        if all(log.result(step) for step in job.steps):
+        if all(log.is_finished(step) for step in job.steps):
             return
         record(1, 4)
         errors = self.failures.get(f"of_{job.out.name}", [])
         if errors and (error := errors.pop(0)):
             raise error
         for step in job.steps:
-            log.finish(step, {"seconds": 3.0, "cpu_seconds": 2.0})
+            log.finish(step, StepResult(seconds=3.0, cpu_seconds=2.0))
 
     def ran(self):
         return sorted(int(job.out.name) for job in self.jobs)
@@ -165,7 +166,7 @@ def test_a_full_disk_stops_the_run_and_is_no_failed_segment(job, monkeypatch):
 
 def test_no_time_is_left_for_a_segment_that_would_begin_too_late(job, monkeypatch):
     late = dataclasses.replace(job, max_minutes=0.0)
-    with pytest.raises(SfmError, match="there was no time left for it"):
+    with pytest.raises(SfmError, match="no time"):
         run(late, monkeypatch, Mapper())
 
 
@@ -196,7 +197,7 @@ def test_an_interrupted_run_keeps_what_is_finished(job, monkeypatch):
     before = kept.stat().st_mtime_ns
     assert run(job, monkeypatch, Mapper()).failed == {}
     assert kept.stat().st_mtime_ns == before
-    assert StepLog(job.segment(2)).result("model")
+    assert StepLog(job.segment(2)).is_finished("model")
 
 
 def test_segments_of_another_cut_are_not_taken_for_these(job, monkeypatch):
@@ -216,7 +217,7 @@ def test_photos_are_split_by_the_mapping_process(job, monkeypatch):
         def __call__(self, each, **options):
             if each.last == SPLIT:
                 assert each.steps == ("features", "matches", "split")
-                StepLog(each.out).finish(SPLIT, {"segments": parts})
+                StepLog(each.out).finish(SPLIT, SplitResult(segments=tuple(parts)))
                 return
             super().__call__(each, **options)
 

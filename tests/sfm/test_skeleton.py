@@ -12,6 +12,7 @@ from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, matching, skeleton
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.matching import read_verified
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 from recon_cli.sfm.skeleton import (
     build_skeleton,
@@ -20,9 +21,8 @@ from recon_cli.sfm.skeleton import (
     complete_tracked,
     copy_coarsest,
     is_continuous,
-    link,
     near_pairs,
-    read_verified,
+    write_usable_matches,
 )
 from recon_cli.sfm.view_overlap import WIDEST, overlapping_images, overlapping_pairs
 
@@ -72,7 +72,7 @@ def make_job(folder, made, tracks=None):
 
 
 def linked(job):
-    return replace(job, linked=job.out / skeleton.LINKED)
+    return replace(job, matches_db=job.out / skeleton.MATCHES_DB)
 
 
 def walk(count=16, step=0.5, **changes):
@@ -175,8 +175,8 @@ def test_observations_of_tracks_follow_the_features_of_an_image(tmp_path):
     job = make_job(tmp_path, made, tracks)
     few = {pair: geometry for pair, geometry in read_verified(job.database).items()
            if pair == (made.names[0], made.names[1])}
-    link(linked(job), job.database, few, tracks, range(6))
-    with pycolmap.Database.open(job.out / skeleton.LINKED) as opened:
+    write_usable_matches(linked(job), job.database, few, tracks, range(6))
+    with pycolmap.Database.open(job.out / skeleton.MATCHES_DB) as opened:
         features = len(made._seen(0)[0])
         keypoints = opened.read_keypoints(1)
         own = tracks.xy[tracks.image == 0] * [WIDTH, HEIGHT]
@@ -197,7 +197,7 @@ def test_pairs_that_were_matched_in_vain_are_remembered(tmp_path):
     geometries = read_verified(job.database)
     dropped = made.names[0], made.names[4]  # tracks are matched 1, 2, 3, 5, ... apart
     kept = {pair: geometry for pair, geometry in geometries.items() if pair != dropped}
-    link(linked(job), job.database, kept, tracks, range(6))
+    write_usable_matches(linked(job), job.database, kept, tracks, range(6))
     assert set(read_verified(linked(job).database)) == set(kept)
     with pycolmap.Database.open(linked(job).database) as opened:
         assert opened.exists_matches(1, 5)

@@ -29,7 +29,7 @@ def test_a_model_that_a_text_holds_together_is_refused(tmp_path):
     made = walk_under_text(600)
     verdict = examine(made.model(), made.write_database(tmp_path / "database.db"), made.names)
     assert verdict.still > MAX_STILL
-    with pytest.raises(SfmError, match="stay where they are in the images"):
+    with pytest.raises(SfmError, match="do not move"):
         check_weak_link(verdict, accept=False)
 
 

@@ -10,10 +10,10 @@ from recon_cli.sfm.time_estimate import (
     PIECE_SECONDS,
     Costs,
     Workload,
+    estimate_for_notice,
     expected_seconds,
     format_minutes,
     measure_slowness,
-    tell_seconds,
 )
 
 ONES = Costs(walk=1, walk_megapixel=1, keyframe=1, walk_mapping=1, photo=10, photo_megapixel=10,
@@ -60,13 +60,13 @@ def test_what_long_walks_took_is_told_within_a_third(frames, keyframes, megapixe
 def test_a_machine_is_measured_in_a_fraction_of_a_second():
     start = time.process_time()
     slowness = measure_slowness(2)
-    assert time.process_time() - start < 100 * PIECE_SECONDS * time_estimate.TRIES
+    assert time.process_time() - start < 100 * PIECE_SECONDS * time_estimate.MEASURES
     assert 0.05 < slowness < 1000
 
 
 def test_a_short_capture_is_told_nothing_and_not_measured(monkeypatch):
     monkeypatch.setattr(time_estimate, "measure_slowness", None)
-    assert tell_seconds(Workload(20, 0.2, tracked=True), 2) is None
+    assert estimate_for_notice(Workload(20, 0.2, tracked=True), 2) is None
 
 
 @pytest.mark.parametrize(("seconds", "text"), [

@@ -44,7 +44,7 @@ def held(parts):
 @pytest.fixture
 def small(monkeypatch):
     """Parts of three frames are worth to be delivered."""
-    monkeypatch.setattr(trusted_part, "FEWEST", 3)
+    monkeypatch.setattr(trusted_part, "FEWEST_FRAMES", 3)
 
 
 @pytest.mark.usefixtures("small")

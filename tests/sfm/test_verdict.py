@@ -137,15 +137,15 @@ def test_a_camera_far_off_a_video_s_path_is_a_jump_there_and_back(tmp_path):
     assert [(jump.before, jump.after) for jump in verdict.jumps] == [
         (names[4], names[5]), (names[5], names[6])]
     assert verdict.jumps[0].ratio == pytest.approx(60, rel=0.1)
-    assert not any("leaps" in problem for problem in verdict.problems)
+    assert not any("jumps" in problem for problem in verdict.problems)
 
 
 def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
     made = walk(motions={5: moved(0, 3000, 0)})
     verdict = verdict_on(made, tmp_path)
     assert not verdict.trusted
-    assert any(f"leaps from {made.names[4]}" in problem for problem in verdict.problems)
-    with pytest.raises(SfmError, match="leaps from"):
+    assert any(f"jumps from {made.names[4]}" in problem for problem in verdict.problems)
+    with pytest.raises(SfmError, match="jumps from"):
         check_weak_link(verdict, accept=False)
     check_weak_link(verdict, accept=False, given=True)
 
@@ -305,14 +305,14 @@ def test_a_few_cameras_have_no_usual_step():
 
 
 def test_every_count_falls_into_one_of_ten_bins():
-    histogram = Histogram.of(np.array([0, 9, 10, 99, 99]))
+    histogram = Histogram.from_values(np.array([0, 9, 10, 99, 99]))
     assert histogram.edges == (0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100)
     assert histogram.counts == (2, 1, 0, 0, 0, 0, 0, 0, 0, 2)
     assert histogram.median == 10
 
 
 def test_no_counts_are_an_empty_histogram():
-    histogram = Histogram.of(np.zeros(0, np.int64))
+    histogram = Histogram.from_values(np.zeros(0, np.int64))
     assert sum(histogram.counts) == 0
     assert histogram.median == 0
 

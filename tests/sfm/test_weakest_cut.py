@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from recon_cli.sfm import weakest_cut
+from recon_cli.sfm import limits, weakest_cut
 from recon_cli.sfm.evidence import MatchEvidence
 
 COUNT = 20
@@ -70,7 +70,7 @@ def test_wrong_images_all_over_the_model_are_not_dropped_one_by_one():
         evidence(lambda first, second: 0.1 if first % 3 == 0 or second % 3 == 0 else 0.9))
     assert len(astray) <= weakest_cut.MAX_OUTLIERS * COUNT
     assert link.share is not None
-    assert link.share < weakest_cut.MIN_AGREEING
+    assert link.share < limits.MIN_ONE_POINT
 
 
 def test_places_that_look_alike_do_not_speak_against_a_right_model():
@@ -111,7 +111,7 @@ def test_an_image_that_shares_no_point_with_the_others_is_astray():
 
 def test_pairs_that_show_no_points_say_nothing():
     made = evidence(halves(0.0))
-    few = np.full_like(made.matches, weakest_cut.MIN_TRACED - 1)
+    few = np.full_like(made.matches, limits.MIN_PAIR_INLIERS - 1)
     link, _ = weakest_cut.find_weakest_cut(dataclasses.replace(
         made, traced=few, joined=np.zeros_like(few), explained=made.matches))
     assert link.share is None

@@ -39,8 +39,8 @@ def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
     assert summary.apart == (tuple(sorted(living)),)
     assert summary.models == (10, 6)
     # No match ties the two together, so that no further way is worth trying.
-    assert [attempt.name for attempt in summary.rungs] == ["exhaustive"]
-    assert_facts(caplog.text, "fell apart", 10, "kept")
+    assert [attempt.name for attempt in summary.attempts] == ["exhaustive"]
+    assert_facts(caplog.text, "disconnected models", 10, "used")
     assert "living000000.png" in caplog.text
 
 
@@ -59,7 +59,7 @@ def test_photos_of_other_things_are_named_and_not_in_the_model(sample_video, tmp
     summary = run(write_inputs(tmp_path / "in", images), tmp_path / "out")
     assert summary.registered == 16
     assert summary.unregistered == tuple(sorted(wrong))
-    assert [attempt.name for attempt in summary.rungs] == ["exhaustive"]
+    assert [attempt.name for attempt in summary.attempts] == ["exhaustive"]
 
 
 @pytest.mark.integration
@@ -67,7 +67,7 @@ def test_photos_are_matched_where_their_coarsest_features_overlap(sample_video, 
     images = frames(sample_video, step=2, count=36)
     summary = run(write_inputs(tmp_path / "in", images), tmp_path / "out")
     assert summary.registered == 36
-    assert [attempt.name for attempt in summary.rungs] == ["coarse"]
+    assert [attempt.name for attempt in summary.attempts] == ["coarse"]
     assert len(database.pair_names(tmp_path / "out" / "database.db")) < 36 * 35 / 2 * 0.75
 
 
@@ -105,7 +105,7 @@ def test_the_frames_of_every_way_of_pairing_meet(sample_video, tmp_path):
         summary = run(write_inputs(tmp_path / pairs, images), tmp_path / f"{pairs}.out",
                       pairs=pairs)
         assert summary.registered == 8
-        attempt, = summary.rungs
+        attempt, = summary.attempts
         assert (attempt.name, attempt.reason, attempt.kept) == (pairs, "it was asked for", True)
 
 

@@ -13,7 +13,8 @@ from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, SfmError
 from recon_cli.sfm import database, time_estimate
-from recon_cli.sfm.job import CameraGroup, StepLog
+from recon_cli.sfm.job import CameraGroup
+from recon_cli.sfm.results import MappingResult, ModelResult, PartResult
 from recon_cli.sfm.segments import SegmentRuns
 from recon_cli.stages import sfm
 from recon_cli.workspace.records import Frame, FrameList, Group
@@ -117,7 +118,7 @@ def told(caplog, **changes):
     """What the stage says of a summary."""
     summary = replace(
         summaries.SFM, frames=60, unregistered=tuple(f"{i}.png" for i in range(11)), models=(49,),
-        rungs=(attempt("exhaustive", registered=40),))
+        attempts=(attempt("exhaustive", registered=40),))
     names = sorted(f"{index}.png" for index in range(60))
     frames = FrameList("video", (Group("a.mp4", 60, 40),), tuple(
         Frame(name, index / 2, "a.mp4", None, held_out=False) for index, name in enumerate(names)))
@@ -127,20 +128,19 @@ def told(caplog, **changes):
 
 def test_the_stretches_that_are_left_out_are_told_with_their_times(caplog):
     text = told(caplog, left_out=("20.png", "21.png", "22.png", "30.png"))
-    assert ("4 frames are left out with the rest of the model: 20.png to 22.png "
-            "(6.5 to 7.5 s), 30.png (12.0 s).") in text
+    assert_facts(text, "rest of the model", "4 frames", "20.png to 22.png (6.5 to 7.5 s)",
+                 "30.png (12.0 s)")
 
 
 def test_models_that_are_left_aside_are_told(caplog):
     text = told(caplog, models=(49, 3), apart=(("5.png", "6.png", "7.png"),))
-    assert_facts(text, "left aside", 3, "frames", "22.5", "6.png to 7.png")
+    assert_facts(text, "disconnected models", 3, "frames", "22.5", "6.png to 7.png")
 
 
 def test_frames_without_a_camera_are_told(caplog):
     text = told(caplog, unregistered_held_out=("3.png",))
-    assert "11 of 60 frames have no camera" in text
-    assert "left out: 0.png to 10.png (0.0 to 1.0 s), 2.png (" in text
-    assert_facts(text, 1, "held out", "3.png")
+    assert_facts(text, "without a camera", "11 of 60 frames", "0.png to 10.png (0.0 to 1.0 s)")
+    assert_facts(text, 1, "Held-out", "3.png")
 
 
 def test_where_there_is_a_verdict_it_speaks_of_the_missing_frames(caplog):
@@ -162,13 +162,13 @@ def test_how_far_given_poses_were_moved_is_told(caplog):
 
 
 def test_every_further_way_to_a_model_is_told_with_its_reason(caplog):
-    text = told(caplog, rungs=(
+    text = told(caplog, attempts=(
         attempt("exhaustive", registered=40),
         attempt("relaxed", reason="only 40 of 60 frames got a camera", registered=49, kept=True),
         attempt("global", reason="the capture fell into 2 models",
                 skipped="it would take about 9 minutes")))
     assert_facts(
-        text, "relaxed was tried", "only 40 of 60 frames got a camera", 49, "model is kept")
+        text, "relaxed", "only 40 of 60 frames got a camera", "registered 49 frames", "is used")
     assert_facts(text, "global was not tried", "the capture fell into 2 models",
                  "it would take about 9 minutes")
     assert "exhaustive" not in text
@@ -185,24 +185,21 @@ def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monke
 def test_a_problem_of_the_model_before_goes_on_within_the_sentence():
     broken = attempt("global", reason="The model is broken.", registered=9)
     line, = sfm._attempts([attempt("exhaustive"), broken])
-    assert_facts(line, "global was tried", "the model is broken", 9)
+    assert_facts(line, "global", "the model is broken", "9 frames")
     assert ".:" not in line
 
 
-def test_held_out_frames_of_a_part_that_is_left_out_are_counted(tmp_path):
+def test_held_out_frames_of_a_part_that_is_left_out_are_counted():
     names = [f"{index}.png" for index in range(6)]
     frames = FrameList("video", (Group("a.mp4", 64, 48),), tuple(
         Frame(name, None, "a.mp4", None, held_out=name in ("0.png", "4.png")) for name in names))
-    known = summaries.SFM.to_json()
-    log = StepLog(tmp_path)
-    part = {"registered": names[:3], "points": 9, "lines": []}
-    log.finish("model", {
-        **known, "parts": [part], "left_out": names[3:5], "notes": [], "seconds": 1.0})
-    log.finish("sparse", {**known["world"], "seconds": 1.0})
-    log.finish("undistorted", {"cameras": [], "seconds": 1.0})
-    steps = ("model", "sparse", "undistorted")
-    job = SimpleNamespace(out=tmp_path, steps=steps, segments=(), part=1)
-    summary = sfm._summary(frames, SegmentRuns(job, {}, {}))
+    part = PartResult(
+        registered=tuple(names[:3]), points=9, mean_track_length=None, reprojection_error_px=None,
+        median_triangulation_angle_deg=None, rejected={}, verdict=None, lines=())
+    model = ModelResult(parts=(part,), models=(3,), left_out=tuple(names[3:5]))
+    job = SimpleNamespace(segments=(), part=1)
+    summary = sfm._summary(
+        frames, SegmentRuns(job, {}, {}), MappingResult(model, summaries.WORLD, (), {}, {}))
     assert summary.left_out == ("3.png", "4.png")
     assert summary.unregistered == ("3.png", "4.png", "5.png")  # no mapper found a place for 5
     assert summary.unregistered_held_out == ("4.png",)

@@ -16,7 +16,7 @@ from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images
 from recon_cli.sfm import database
 from recon_cli.sfm.job import StepLog
-from recon_cli.sfm.parts import FINISHED
+from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.stages import sfm
 from recon_cli.workspace.summaries import SfmSummary
 
@@ -41,8 +41,9 @@ def matched(out):
     out.mkdir(parents=True)
     database.seal(MADE.write_database(out / "database.db"))
     log = StepLog(out)
-    for step in ("features", "matches"):
-        log.finish(step, {"rows": 0, "seconds": 3.0, "cpu_seconds": 2.0})
+    log.finish("features", FeaturesResult(rows=0, keypoints=0, seconds=3.0, cpu_seconds=2.0))
+    log.finish("matches", MatchesResult(
+        rows=0, verified_pairs=0, matches=0, seconds=3.0, cpu_seconds=2.0))
     return out
 
 
@@ -113,7 +114,7 @@ def test_the_other_part_is_taken_without_mapping_again(mapped, base, tmp_path):
 def test_axes_are_chosen_anew_without_mapping_again(mapped, base, tmp_path):
     taken = run(base, tmp_path / "out", earlier=result_of(mapped), gravity="off")
     assert taken.seconds["model"] == mapped[1].seconds["model"]
-    assert FINISHED in StepLog(tmp_path / "out").result("model")
+    assert StepLog(tmp_path / "out").result("model", ModelResult).earlier is not None
     assert not taken.world.evidence.up_found
 
 
@@ -143,7 +144,7 @@ def test_a_run_that_was_killed_while_it_took_the_parts_takes_them_again(mapped, 
 def test_parts_that_were_changed_are_not_taken(mapped, base, tmp_path, lost):
     out = matched(tmp_path / "out")
     run(base, out, earlier=result_of(mapped, **lost), part=2)  # maps by itself
-    assert FINISHED not in StepLog(out).result("model")
+    assert StepLog(out).result("model", ModelResult).earlier is None
     assert placed(out) == PARTS[1]
 
 

@@ -68,7 +68,7 @@ def test_a_manifest_that_names_files_elsewhere_is_refused(
     file = {"sha256": "0", "size": 1, "mtime_ns": 1}
     rewrite(workspace.folder("train") / "manifest.json",
             lambda value: value["outputs"].update({name: file}))  # type: ignore[attr-defined]
-    with pytest.raises(ManifestError, match="no file of a stage") as caught:
+    with pytest.raises(ManifestError, match="not a file of a stage") as caught:
         workspace.manifest("train")
     assert "recon clean train" in caught.value.hint
 

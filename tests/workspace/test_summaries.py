@@ -22,7 +22,7 @@ ATTEMPT = AttemptSummary(
     name="relaxed", reason="few cameras", skipped="", registered=9, models=(9, 3), weak_link=None,
     reprojection_error_px=0.5, seconds=1.5, kept=True)
 MAPPED = replace(
-    summaries.SFM, rungs=(ATTEMPT,), apart=(("a.png", "b.png"),), rejected={"c.png": "wrong"},
+    summaries.SFM, attempts=(ATTEMPT,), apart=(("a.png", "b.png"),), rejected={"c.png": "wrong"},
     poses=PosesSummary(use="refine", metric=True, moved_median=0.1))
 
 
