@@ -11,8 +11,9 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.jobs import open_job, summary_text
+from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.commands.sentences import describe_summary
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, StageStatus, free_space
 from recon_cli.progress import format_duration, format_megabytes
@@ -60,17 +61,18 @@ def _refuse_damaged(job: Job, stages: Sequence[StageStatus]) -> None:
 
 
 def status_table(stages: Sequence[StageStatus]) -> str:
-    """Returns stage, state, time, and reasons or summary, one line a stage."""
+    """Returns stage, state, time, and reasons or a sentence, one line a stage."""
     rows = [("stage", "state", "time", "")]
     for stage in stages:
         state = stage.state
         if state == "partial":
             state = f"partial ({describe_progress(stage.done, stage.total)})"
-        elif state == "fresh" and stage.total:  # a training that goes on from it
-            state = f"fresh, going on ({describe_progress(stage.done, stage.total)})"
+        elif state == "fresh" and stage.total:  # a training continues it
+            state = f"fresh, continuing ({describe_progress(stage.done, stage.total)})"
         time = "" if stage.seconds is None else format_duration(stage.seconds)
         rows.append((
-            stage.name, state, time, "; ".join(stage.reasons) or summary_text(stage.summary)))
+            stage.name, state, time,
+            "; ".join(stage.reasons) or describe_summary(stage.name, stage.summary)))
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True))
              for row in rows]
