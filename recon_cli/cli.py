@@ -140,7 +140,7 @@ def _tell(error: BaseException, complete: Callable[[str], str]) -> int:
         if known is None:
             console.print_error(
                 f"{type(error).__name__}: {error}",
-                "This is a bug in recon. Run the command again with -v and report what it prints.")
+                "This is a bug in recon. Run the command again with -v and report its output.")
         else:
             console.print_error(known.message, complete(known.hint))
     return _exit_code(error)

@@ -38,7 +38,7 @@ def exit_code(error: BaseException | None) -> int:
 
 
 def describe_end(error: BaseException | None) -> str:
-    """Returns the line that says why a command ended, and how to go on."""
+    """Returns the line that says why a command ended, and how to continue."""
     number = exit_code(error) - ExitCode.SIGNAL
     what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
     return f"{what}; run the same command again to resume"

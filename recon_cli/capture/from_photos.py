@@ -151,7 +151,7 @@ class _TakenPhotos:
 
     record: Record
     broken: Mapping[str, str]  # why some cannot be read, by file name
-    dropped: frozenset[str]  # that show nothing, or the same as others; of a sequence it is no news
+    dropped: frozenset[str]  # that show nothing, or the same as others; not reported for a sequence
     tracks: Tracks | None = None  # through the photos that follow each other, by their frames
     sharpness: Mapping[str, float] = field(default_factory=dict)  # of these, by file name
 
@@ -260,8 +260,8 @@ def _list_photos(
     for folder in dict.fromkeys((path, home)):
         for text in find_lists(folder, [photo.name for photo in photos], known=taken):
             notices.append(
-                f"{text.name} names the photos and is not read: what it says of them (such as "
-                "places or angles) is not used.")
+                f"{text.name} names the photos and is not read: its data on them (such as "
+                "places or angles) are not used.")
     for notice in (*notices, *left_out):
         ctx.notice(notice)
     return path, home, PhotoFolder(photos, found.broken)

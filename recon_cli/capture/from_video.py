@@ -49,7 +49,7 @@ class ScannedVideo:
 def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
     """Returns a video after a pass over all of its frames; `scan_file` keeps it for a next run.
 
-    InputError if it is no video, has too few whole frames, shows nothing, or shows no motion.
+    InputError if it is not a video, has too few undamaged frames, or shows nothing or no motion.
     """
     if scan_file.exists():
         scan = Scan.read(scan_file)
@@ -171,7 +171,7 @@ def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
     decoded, whole = len(scan.whole), int(scan.whole.sum())
     if whole < frame_selection.MIN_FRAMES:
         raise InputError(
-            f"{path} has {whole} whole frames of {scan.expected}, but at least "
+            f"{path} has {whole} undamaged frames of {scan.expected}, but at least "
             f"{frame_selection.MIN_FRAMES} are needed.",
             hint="Give a longer video, or copy it from the camera again if it should be longer.")
     inexact = max(COUNT_SHARE * scan.declared, COUNT_FRAMES)

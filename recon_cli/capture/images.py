@@ -36,7 +36,7 @@ RAW_SUFFIXES = frozenset({
 # What cameras and converters write. Pillow also opens documents (EPS by way of Ghostscript).
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM")
 ANIMATED = frozenset({"WEBP", "PNG", "AVIF", "HEIF"})  # those that may hold a film, or a burst
-# A file with one of these endings that cannot be read is a broken photo; any other is no photo.
+# A file with one of these endings that cannot be read is a broken photo; any other is not a photo.
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
     ".ppm", ".tif", ".tiff", ".webp"}
@@ -80,7 +80,7 @@ class Photo:
     mode: str = "RGB"  # Pillow's, of the file
     wide: bool = False  # its values have 16 bits
     pictures: int = 1  # of an animation, of which the first one is read
-    panorama: bool = False  # its metadata says that it is no picture of a pinhole camera
+    panorama: bool = False  # its metadata says that no pinhole camera took it
 
     @property
     def name(self) -> str:

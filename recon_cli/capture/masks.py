@@ -78,7 +78,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     if not mask.any():
         raise InputError(
             f"The mask {path.name} ignores every pixel: its brightest value is {gray.max()}, but "
-            "255 marks what counts.",
+            "255 marks the pixels that count.",
             hint="Write masks with 0 and 255, or remove the photo.")
     return mask
 

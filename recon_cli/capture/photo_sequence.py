@@ -159,7 +159,7 @@ def _read_time(photo: Photo) -> datetime | None:
             detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
         return datetime.strptime(
             str(detail.get(ExifTags.Base.DateTimeOriginal)), "%Y:%m:%d %H:%M:%S")
-    except BROKEN:  # a ValueError where it is no time
+    except BROKEN:  # a ValueError where it is not a time
         return None
 
 
@@ -186,7 +186,7 @@ def _scan_run(
         measured = measure_sequence(
             grays([place for place in measured.places if place not in strangers]), len(run),
             least=least)
-        assert measured is not None, "a sequence is one without what interrupts it"
+        assert measured is not None, "a sequence is one without interruptions"
     photo = photos[measured.places[0]]
     return PhotoSequence(
         tuple(measured.places), measured.scan(photo.width, photo.height), tuple(strangers))

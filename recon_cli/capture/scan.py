@@ -105,7 +105,7 @@ def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     """Returns the scan of a video, the same for any number of threads; calls `step` per frame.
 
     A damaged stream is scanned again by one thread, which alone is reproducible around the damage.
-    InputError if the file is no video, or no frame of it can be decoded.
+    InputError if the file is not a video, or none of its frames can be decoded.
     """
     scan = _scan_once(path, threads=threads, step=step)
     if scan.lost and threads > 1:

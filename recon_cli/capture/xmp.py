@@ -24,7 +24,7 @@ def read_xmp(image: Image.Image) -> bytes:
 
 
 def is_panorama(xmp: bytes, width: int, height: int) -> bool:
-    """Returns whether a picture's XMP says that it is no perspective picture.
+    """Returns whether a picture's XMP says that it is not a perspective picture.
 
     Pictures cut from a panorama often keep its XMP: then their shape is another.
     """

@@ -51,7 +51,7 @@ def run_stages(
         callbacks)
     start = Start.IMPORTED if call.from_import else Start.AUTO
     targets = [
-        Target(row.name, config, sources if row.takes else (),
+        Target(row.name, config, sources if row.input_metavar else (),
                start if row.name == IMPORT.name else Start.AUTO)
         for row, config in zip(rows, configs.values(), strict=True)]
     plan.run(job, verb, targets, again=call.again)

@@ -99,7 +99,7 @@ def _print_all(ctx: click.Context, _parameter: click.Parameter, value: bool) -> 
 
 
 class PathType(click.Path):
-    """A path that is no pipe, socket or device, and no longer than one may be."""
+    """A path that is not a pipe, socket or device, and not longer than the system allows."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(path_type=Path, **settings)
@@ -201,9 +201,9 @@ def assignments(example: str = "train.iterations=1000") -> Decorator:
 
 def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
     """Returns a decorator that adds a stage's options; device and backend where it `renders`."""
-    where = compute(trains=config in (TrainConfig, PruneConfig)) if renders else of(
+    where = compute(trains=config in (TrainConfig, PruneConfig)) if renders else config_options(
         ComputeConfig, only=("threads",))
-    return stack([of(config), where, again, print_config, common()])
+    return stack([config_options(config), where, again, print_config, common()])
 
 
 def executor(what: str) -> Decorator:
@@ -220,10 +220,10 @@ def executor(what: str) -> Decorator:
 
 def compute(*, trains: bool = False, without: Sequence[str] = ()) -> Decorator:
     """Returns a decorator that adds where a verb computes, and the memory for one that trains."""
-    return of(ComputeConfig, without=(*without, *(() if trains else ("max_memory",))))
+    return config_options(ComputeConfig, without=(*without, *(() if trains else ("max_memory",))))
 
 
-def of(
+def config_options(
     config: type[StageConfig], *, only: Sequence[str] = (), without: Sequence[str] = (),
     expert: Sequence[str] = (), lead: str = "",
 ) -> Decorator:

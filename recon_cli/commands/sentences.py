@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import singledispatch
 from typing import Any
 
+from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ManifestError
 from recon_cli.progress import format_megabytes
 from recon_cli.stages import IMPORT, STAGES
@@ -20,8 +21,6 @@ from recon_cli.workspace.summaries import (
     SfmSummary,
     TrainSummary,
 )
-
-MODEL_LABELS = {"base": "original", "pruned": "compact"}  # as users read them
 
 
 def describe_summary(stage: str, summary: Mapping[str, Any]) -> str:

@@ -42,7 +42,7 @@ def status(call: Call, as_json: bool) -> None:
         _refuse_damaged(job, stages)
         return
     if not job.workspace.root.exists():
-        logger.warning("there is no workspace at %s yet", job.workspace.root)
+        logger.warning("no workspace at %s yet", job.workspace.root)
     click.echo(status_table(stages))
     for stage in stages:
         if stage.state == "fresh":
@@ -82,7 +82,7 @@ def status_table(stages: Sequence[StageStatus]) -> str:
 @verb("clean")
 @click.argument(
     "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice([row.name for row in STAGES]))
-@click.option("--dry-run", is_flag=True, help="Only print what would be removed.  [default: off]")
+@click.option("--dry-run", is_flag=True, help="Only list the files and sizes.  [default: off]")
 @options.common()
 @pass_call
 def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
@@ -94,7 +94,7 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
     job = Job(Workspace(call.workspace), table=STAGES)  # recon.toml may be damaged
     freed = free_space(job, stages, dry=dry_run)
     for item in freed:
-        link = " (a link; what it points to stays)" * item.is_link
+        link = " (a link; its target stays)" * item.is_link
         click.echo(f"{item.path}: {format_megabytes(item.size)}{link}")
     outcome = "would be freed" if dry_run else "freed"
     click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")

@@ -67,7 +67,7 @@ def field_type(config: type[StageConfig], name: str) -> tuple[type, bool]:
 
 
 def member_types(kind: Any) -> tuple[type, ...]:
-    """Returns the types of a tuple's members, (str, str, float); none where a field is no tuple."""
+    """Returns the types of a tuple's members, (str, str, float); empty for any other field."""
     return get_args(kind) if get_origin(kind) is tuple else ()
 
 

@@ -36,7 +36,7 @@ class FileFinder:
     def find(self, name: object, where: str) -> Path:
         """Returns the path of a file, which exists unless none has its name.
 
-        FormatError if `name` is no text, or leads out of the folder and no file has its name.
+        FormatError if `name` is not a string, or leads out of the folder and no file has its name.
         """
         try:
             path = with_suffix(resolve_inside(self._folder, name, where))

@@ -85,7 +85,7 @@ def read_posed(path: Path) -> PosedSet:
     layout = next((row for row in LAYOUTS if row.fits(path)), None)
     if layout is None:
         known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
-        raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
+        raise InputError(f"{path} is not a data set with poses.", hint=f"Known are {known}.")
     try:
         return _attach_masks(layout.read(path), path if path.is_dir() else path.parent)
     except FormatError as error:

@@ -77,8 +77,8 @@ def _read_depth(path: Path) -> NDArray[np.generic]:
         raise FormatError(f"{path} cannot be read as depth: {error}.", hint=hint) from error
     if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
         raise FormatError(
-            f"{path} is no depth: it holds {values.dtype} of shape {values.shape}, needed one "
-            "value a pixel.", hint=hint)
+            f"{path} is not a depth image: it holds {values.dtype} of shape {values.shape}, "
+            "needed one value a pixel.", hint=hint)
     return values
 
 
@@ -185,7 +185,7 @@ def _check_sizes(items: Sequence[PosedImage], sizes: Sequence[tuple[int, int]]) 
             raise FormatError(
                 f"{item.path} is {width}x{height} pixels, but its camera "
                 f"{item.lens.width}x{item.lens.height}; most images are {factor:.4g} times as "
-                "wide as their cameras, which is no common factor.",
+                "wide as their cameras, which is not a common factor.",
                 hint="Use the images that the poses were made for, all of them or all reduced "
                 "by one factor; the size is that of the file, before any EXIF rotation.")
     return factor
@@ -217,7 +217,7 @@ def resolve_inside(folder: Path, name: object, where: str) -> Path:
 
     A data set may come from anywhere, so it may not name files elsewhere on the disk; links below
     the folder are followed. `name` has either kind of slash; `where` is its entry, for messages.
-    FormatError if `name` is no text, absolute, or leads out of the folder.
+    FormatError if `name` is not a string, is absolute, or leads out of the folder.
     """
     if not isinstance(name, str) or not name.strip() or "\0" in name:
         raise FormatError(f"{where} has no file name.")

@@ -201,7 +201,7 @@ def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         raise FormatError(f"{file} lists no frames.", hint=_HINT)
     for at, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise FormatError(f"{file}, frame {at}, is no entry with names.", hint=_HINT)
+            raise FormatError(f"{file}, frame {at}, is not an object.", hint=_HINT)
     return {key: item for key, item in value.items() if key != "frames"}, entries
 
 
@@ -234,7 +234,7 @@ def _read_parts(shared: Mapping[str, Any], file: Path) -> dict[str, str] | None:
             f"{file} has val_filenames or test_filenames, but no train_filenames.", hint=_HINT)
     for part, names in lists.items():
         if names is not None and not isinstance(names, list):
-            raise FormatError(f"{file}: {part}_filenames is no list.", hint=_HINT)
+            raise FormatError(f"{file}: {part}_filenames is not a list.", hint=_HINT)
         parts.update({_plain(name): part for name in names or ()})
     return parts
 
@@ -349,7 +349,7 @@ def write_transforms(
     names = [name for name, _ in views]
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise ValueError(f"{name} is no path below the folder of {path}")
+            raise ValueError(f"{name} is not a path below the folder of {path}")
     if len(set(names)) < len(names) or not set(held_out) <= set(names):
         raise ValueError("duplicate views, or held-out ones that do not exist")
     inner = [_intrinsics(camera) for _, camera in views]

@@ -53,7 +53,7 @@ class SeedScores:
     def table(self) -> Table:
         """Returns mean and deviation of every figure."""
         def cells(figures: Figures, sign: str = "") -> list[str]:
-            return [Spread.of(values).text(sign + _FORMATS[name])
+            return [Spread.from_values(values).text(sign + _FORMATS[name])
                     for name, values in figures.items()]
 
         rows = [(self.kinds[name], *cells(figures)) for name, figures in self.models.items()]
@@ -64,7 +64,7 @@ class SeedScores:
     def record(self) -> dict[str, Any]:
         """Returns what seeds.json holds."""
         def spreads(figures: Figures) -> dict[str, Any]:
-            return {name: {"values": list(values), **dataclasses.asdict(Spread.of(values))}
+            return {name: {"values": list(values), **dataclasses.asdict(Spread.from_values(values))}
                     for name, values in figures.items()}
 
         return {"seeds": list(self.seeds),

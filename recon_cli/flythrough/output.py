@@ -171,7 +171,7 @@ class VideoEncoding:
 
 
 def check_encoding(encoding: VideoEncoding) -> None:
-    """Raises ConfigError if there is no encoder, or it rejects this size or rate."""
+    """Raises ConfigError without an encoder, or if it rejects this size or rate."""
     encoder = encoding.encoder()
     context = VideoCodecContext.create(encoder, "w")
     assert isinstance(context, VideoCodecContext)

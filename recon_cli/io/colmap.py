@@ -328,4 +328,4 @@ def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
 
 def model_error(path: Path, fault: str, hint: str) -> FormatError:
     """Returns the error for a damaged file."""
-    return FormatError(f"{path} is not a whole COLMAP model: {fault}.", hint=hint)
+    return FormatError(f"{path} is not a complete COLMAP model: {fault}.", hint=hint)

@@ -67,7 +67,7 @@ def _glb_bytes(
         primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
         tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] = True
         primitive["material"] = 0
-        tree["materials"] = [{  # without the extension it is no metal, as the default is
+        tree["materials"] = [{  # not metallic, as the default would be
             "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
             "extensions": {_UNLIT: {}}}]
         tree["extensionsUsed"] = [*tree.get("extensionsUsed", ()), _UNLIT]

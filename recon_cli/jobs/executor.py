@@ -153,7 +153,7 @@ def start_executor(
     as suit the machines; a GPU if they have one.
 
     Raises:
-        BackendError: there is no Ray cluster, or it lacks what a command needs.
+        BackendError: no Ray cluster was found, or it lacks resources for a command.
         WorkspaceError: a machine of it does not see `folder` or one of `inputs`.
     """
     if place == "ray":

@@ -55,7 +55,7 @@ class RayExecutor:
         """Connects to a cluster and checks each machine; None: as many as suit the cluster.
 
         Raises:
-            BackendError: Ray is missing or runs this very command, there is no cluster, a machine
+            BackendError: Ray is missing or runs this very command, no cluster was found, a machine
                 lacks recon or has another version, or none has what a command needs.
             WorkspaceError: a machine does not see `folder` or one of `inputs`.
         """

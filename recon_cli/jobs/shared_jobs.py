@@ -109,7 +109,7 @@ def _look(job: SharedJob) -> tuple[float, str]:
 
 @contextmanager
 def _watching(bar: Bar, look: Callable[[], tuple[int, str]]) -> Iterator[None]:
-    """Shows on a bar what `look` returns: percent that are done, and what is going on."""
+    """Shows on a bar the percentage done and the activity that `look` returns."""
     ended = threading.Event()
 
     def watch() -> None:

@@ -66,7 +66,7 @@ def inlined(function: Compiled) -> Compiled:
 
 @cache
 def cache_folder() -> Path | None:
-    """Returns the folder of the machine code; None where there is no place for it."""
+    """Returns the folder of the machine code; None if none can be written."""
     folder = machine.cache_root() / "kernels" / fingerprint()
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)

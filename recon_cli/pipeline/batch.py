@@ -1,4 +1,4 @@
-"""Reconstructs many captures, each in a workspace of its own, and goes on after failures."""
+"""Reconstructs many captures, each in a workspace of its own, and continues after failures."""
 
 from __future__ import annotations
 

@@ -87,10 +87,10 @@ class WorkspaceCheck:
     def row(self, name: str) -> Stage:
         """Returns the row of a stage, without the needs that an imported scene spares it."""
         row = self._rows[name]
-        if not row.spares or not self._imported:
+        if not row.optional_when_imported or not self._imported:
             return row
-        needs = tuple(need for need in row.needs if need not in row.spares)
-        return dataclasses.replace(row, needs=needs, uses=(*row.spares, *row.uses))
+        needs = tuple(need for need in row.needs if need not in row.optional_when_imported)
+        return dataclasses.replace(row, needs=needs, uses=(*row.optional_when_imported, *row.uses))
 
     @cached_property
     def _imported(self) -> bool:

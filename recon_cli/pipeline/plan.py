@@ -58,7 +58,7 @@ class StageStatus:
     state: str  # fresh, stale, partial, missing or damaged
     reasons: tuple[str, ...]  # why it is stale or what is damaged, in words
     done: int  # how much of an interrupted run would be resumed; 0 where there is none
-    total: int  # of how much; 0 where there is no interrupted run
+    total: int  # of how much; 0 without an interrupted run
     seconds: float | None  # that the finished result took; None where there is none
     summary: dict[str, Any]  # of the finished result
     notices: tuple[str, ...]  # what the user should know but makes nothing stale
@@ -193,7 +193,7 @@ def command(checks: WorkspaceCheck, check: StageCheck) -> str:
     words = ["recon", check.row.verb]
     latest = check.partial_run or check.manifest
     if latest is None:
-        return " ".join([*words, check.row.takes] if check.row.takes else words)
+        return " ".join([*words, check.row.input_metavar] if check.row.input_metavar else words)
     config, default = checks.config(check.row, latest.key), checks.config(check.row, None)
     for item in dataclasses.fields(check.row.config):
         value, info = getattr(config, item.name), option_info(item)
@@ -271,7 +271,7 @@ def _find_fresh(
 
 
 class _LogFile(logging.FileHandler):
-    """The log in the workspace, whose loss for want of space is no reason to fail, or to print."""
+    """The log in the workspace: where the disk is full, lines are lost without a message."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  # logging's name
         """Leaves a failure to write to what has to be written."""

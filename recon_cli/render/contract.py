@@ -20,7 +20,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
 TILE = 16  # pixels; the tile of the paper and of INRIA's rasterizer
-ALPHA_MIN = 1.0 / 255.0  # a fragment below one 8-bit step is no fragment
+ALPHA_MIN = 1.0 / 255.0  # a fragment below one 8-bit step is ignored
 ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) bounded in the backward pass
 # A pixel stops before it would fall below this: 1e-4 less a margin for rounding, so that two
 # fragments of alpha .99, which leave 1e-4, are both drawn whatever the precision.

@@ -86,7 +86,7 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
         return _fastest(known.values(), device), device
     if backend not in known:
         raise BackendError(
-            f"There is no backend {backend!r}.", hint="Known are " + ", ".join(known) + ".")
+            f"Unknown backend {backend!r}.", hint="Known are " + ", ".join(known) + ".")
     status = known[backend]
     if device not in status.devices or status.missing:
         reason = status.missing or f"it does not run on {device}"
@@ -170,7 +170,7 @@ def renderer(backend: str) -> Renderer:
         from recon_cli.render.triton.backend import render as triton_render
 
         return triton_render
-    raise BackendError(f"There is no backend {backend!r}.", hint="See `recon doctor`.")
+    raise BackendError(f"Unknown backend {backend!r}.", hint="See `recon doctor`.")
 
 
 def render(
@@ -197,7 +197,7 @@ def render(
 
     Raises:
         ValueError: a shape, dtype or device does not fit.
-        BackendError: there is no such backend here.
+        BackendError: the backend is unknown or not available here.
     """
     check_inputs(splats, camera, background, sh_degree, mask)
     return renderer(backend)(splats, camera, background, sh_degree, scores, mask)
@@ -220,7 +220,7 @@ def find_crossing(
 
     Raises:
         ValueError: a shape, dtype or device does not fit, or the level is none.
-        BackendError: there is no such backend here.
+        BackendError: the backend is unknown or not available here.
     """
     check_inputs(splats, camera, splats.means.new_zeros(3), 0, None)
     if not TRANSMITTANCE_MIN < level < 1:

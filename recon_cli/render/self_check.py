@@ -151,7 +151,7 @@ def check(
             for quantity, error in _compare(candidate, splats, camera):
                 errors[f"{quantity}, {label} scene"] = (
                     error if math.isfinite(error) else _NOT_FINITE)
-        wrong = [f"{quantity}: error {error:.3g} times what is allowed"
+        wrong = [f"{quantity}: error {error:.3g} times the allowed difference"
                  for quantity, error in errors.items() if error > 1]
         failure = "; ".join(wrong[:3]) + (f"; {len(wrong) - 3} more" if len(wrong) > 3 else "")
     except Exception as error:  # compilers and drivers raise many types

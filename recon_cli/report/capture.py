@@ -56,7 +56,7 @@ class Capture:
     sheets: tuple[Markup, ...]  # contact sheets
     more_sheets: int  # contact sheets that are left out
     overlays: tuple[Markup, ...]  # frames with what is fixed to the camera in red
-    thumbs: tuple[tuple[str, Markup], ...]  # (name, picture) of frames if there is no sheet
+    thumbs: tuple[tuple[str, Markup], ...]  # (name, picture) of frames, without a contact sheet
     plan: Markup | None  # None without a mapping to draw
     notes: tuple[str, ...]  # on the plan
     strip: Markup | None  # all frames in order
@@ -87,7 +87,7 @@ def read_capture(stages: StageReports) -> Capture:
         overlays = [data_uri(fit_image(read_png(path), WIDTH), _THUMB_QUALITY)
                     for path in sorted(ingest.folder.glob("*overlay.png"))[:_SHEETS]]
     except (FormatError, OSError) as error:
-        damaged.append(f"What is masked is not shown: {error}")
+        damaged.append(f"Masked areas are not shown: {error}")
     scene = None
     if stages["sfm"].there and frames:
         try:
@@ -138,7 +138,7 @@ def _draw_plan(
     if not axes.known:
         notes.append("Up is not known: the view is along the mean up of the cameras.")
     if not metres:
-        notes.append("The scale is arbitrary, so there is no scale bar; "
+        notes.append("The scale is arbitrary, so the plan has no scale bar;  "
                      "recon sfm --scale-between A B METRES sets it.")
     if regions:
         notes.append("Numbers are poorly seen regions, as listed under Trust.")

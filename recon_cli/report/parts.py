@@ -158,12 +158,12 @@ def advise(gap: Gap) -> str:
     first, second = _format_time(gap.before), _format_time(gap.after)
     if not first or not second:
         return (f"Take ten or more photos on the way from where {gap.before.name} was taken to "
-                f"where {gap.after.name} was taken; each shows half of what the one before shows.")
+                f"where {gap.after.name} was taken; each overlaps the one before by half.")
     if gap.before.source != gap.after.source:
         where = f"the way from {gap.before.source} at {first} to {gap.after.source} at {second}"
     else:
         start, end = _format_time(gap.before, -MARGIN), _format_time(gap.after, MARGIN)
-        where = f"what the film shows from {start} to {end}"
+        where = f"the places of the film from {start} to {end}"
     return (f"Film {where} again: walk slowly from where the left picture was taken to where the "
             "right one was taken, sideways rather than turning on the spot, and keep half of the "
             "view in the picture from one second to the next.")

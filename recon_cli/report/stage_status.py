@@ -161,7 +161,7 @@ def _read_settings(stage: StageReport) -> StageSettings:
             value = read_json(stage.folder / "config.json")
             chosen = value if isinstance(value, dict) else {}
         except FormatError as error:
-            damaged = f"What training decided by itself is not shown: {error.message}"
+            damaged = f"The decisions of training are not shown: {error.message}"
     rows = tuple((
         name, _format_option(value),
         _format_option(chosen[name]) if name in chosen and chosen[name] != value else "")

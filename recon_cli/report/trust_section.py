@@ -69,7 +69,7 @@ def read_trust(stages: StageReports) -> TrustSection:
             "Trust was not measured." if stages["evaluate"].there else "Trust needs evaluate.")
     if record.reason:
         return TrustSection(record.reason)
-    models = {name: trust for name in MODELS if (trust := record.of(name)) is not None}
+    models = {name: trust for name in MODELS if (trust := record.model_trust(name)) is not None}
     first = next(iter(models.values()))
     return TrustSection(
         "", f"{first.surface.well:.0%} of the surface that the views show is well seen: by "

@@ -89,7 +89,7 @@ _MAX_ALONE_DEG = 2.0
 # degrees, rolled by 2, said an error of 1.9 degrees and were off by 5.2.
 _MIN_SPREAD_ALONE_DEG = 12.0
 _MAX_WITH_FLOOR_DEG = 10.0
-_MIN_UPRIGHT = 0.7  # share; a phone that was turned over halfway is no witness of which end is up
+_MIN_UPRIGHT = 0.7  # share; a phone turned over halfway does not show which end is up
 _CONE_DEG = (6.0, 15.0)  # least and greatest; in between three standard errors
 _STEPS = 50  # of the reweighting; it converges in about ten
 _FLOOR_WEIGHT = np.radians(0.5)  # rolls below this count alike: no single frame decides

@@ -2,7 +2,7 @@
 
 Leaves splats.ply, the states at the middle (where pruning branches off) and the end of the run,
 plan.json, config.json, and log.jsonl with loss, validation PSNR, count and seconds. It begins with
-the points of sfm, or goes on from a finished model: of a shorter run, or imported. A large scene is
+the points of sfm, or continues a finished model: of a shorter run, or imported. A large scene is
 trained in blocks, by jobs of their own, and has no state at the end: its blocks were trained apart.
 """
 

@@ -159,7 +159,7 @@ def _finetune(
     room = gaussians_that_fit(scene, config, ctx)
     if room < len(splats):
         ctx.notice(f"the merged scene has {len(splats):,} Gaussians, but memory has room to train "
-                   f"{room:,}: it is not fine-tuned as a whole, and borders may show")
+                   f"{room:,}: the merged scene is not fine-tuned, and borders may show")
         return None
     slower = dataclasses.replace(config, **{
         name: _OTHER_RATES * getattr(config, name)

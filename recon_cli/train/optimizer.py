@@ -86,10 +86,10 @@ class SplatOptimizer:
             held = self._buffers.get(name, {}).get("value")
             if held is None or held.shape != (room, *value.shape[1:]):
                 self._reserve(name, value, room)
-        self.splats = Splats.of({
+        self.splats = Splats.from_parameters({
             name: self._view(name, "value").detach().requires_grad_() for name in self._buffers
         }, like.backdrop)
-        self.gradients = Splats.of({
+        self.gradients = Splats.from_parameters({
             name: self._view(name, "gradient") for name in self._buffers
         }) if self.fused else self.splats
 

@@ -1,6 +1,6 @@
 """What training decides before its first step: parts of the model, steps, cap of the count.
 
-The plan is recorded, and an interrupted run goes on by the record: whatever a clock or a trial
+The plan is recorded, and an interrupted run continues by the record: whatever a clock or a trial
 would say now, the same numbers give the same bytes.
 """
 
@@ -106,7 +106,7 @@ def make_plan(
 ) -> TrainPlan:
     """Returns the plan; --minutes include the calibration and the seconds `spent` on trials.
 
-    `model` is what the run goes on from.
+    `model` is the one that the run continues.
     """
     continues_at = None if model is None else model.steps
 
@@ -194,7 +194,7 @@ def plan_task(
 ) -> Task:
     """Returns the task of a run by its plan: a recorded one, or one that is made and recorded.
 
-    `model` is what the run goes on from: it keeps the parts of that.
+    `model` is the one that the run continues, with its parts.
     """
     if (out / TrainPlan.FILE).exists():
         recorded = dataclasses.replace(read_config(out), checkpoint_every=config.checkpoint_every)

@@ -1,4 +1,4 @@
-"""A pruning run on disk: it goes on after a kill, and may search how much can go.
+"""A pruning run on disk: it resumes after a kill, and may search the largest ratio.
 
 `round-<k>.safetensors` is a state after the k-th removal, `rounds.json` lists the removals. The
 state is written first and the list after it: a kill in between repeats the round before, to the
@@ -114,17 +114,17 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     if steps is None:
         steps = max(train_config.iterations // _END_RECOVERY, _END_EPOCHS * epoch)
         if config.at == "mid":
-            # as many as the unpruned run took, which may have stopped early; where that went on for
+            # as many as the unpruned run took, which may have stopped early; where it continued for
             # a few steps only, too few to recover
             rest = restore_state(final, task).steps - start.steps
-            steps = max(rest, steps) if _went_on(train) else rest
+            steps = max(rest, steps) if _was_continued(train) else rest
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
         config.rounds or rounds_within(steps, epoch), seconds_at(train / LOG, start.iteration))
 
 
-def _went_on(train: Path) -> bool:
-    """Returns whether a training went on from a finished model."""
+def _was_continued(train: Path) -> bool:
+    """Returns whether a training continued a finished model."""
     plan = TrainPlan.read(train) if (train / TrainPlan.FILE).exists() else None
     return plan is not None and plan.continues_at is not None
 

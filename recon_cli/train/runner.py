@@ -36,7 +36,7 @@ class Segment:
     until: int  # step at its end
     first: int = 0  # step at which it begins
     earlier_seconds: float = 0.0  # training seconds before that
-    checkpoint: str = CHECKPOINT  # file name of the state that a later run goes on from
+    checkpoint: str = CHECKPOINT  # file name of the state that a later run continues
     # file names under which the state after certain steps is kept
     keep: Mapping[int, str] = field(default_factory=dict)
 
@@ -112,7 +112,7 @@ class TrainLog(TrainCallback):
         self.keep()
 
     def keep(self) -> None:
-        """Records what a later run that goes on from here must find in the log."""
+        """Records the log up to here, for a later run that continues from here."""
         journal.expect_growth(self._path)
 
     def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
@@ -139,7 +139,7 @@ class ProgressCallback(TrainCallback):
         validation = "" if psnr is None else f", validation {psnr:.2f} dB"
         self._bar.note(f"loss {report.loss:.4f}{validation}, {report.gaussians:,} Gaussians")
         if report.goes_on_at is not None:
-            logger.info("the validation views gain nothing more after step %d: the run goes on at "
+            logger.info("the validation score is flat after step %d: the run continues at "
                         "step %d, with falling rates", report.iteration, report.goes_on_at)
 
 

@@ -1,4 +1,4 @@
-"""All that a run needs to go on with the very same bytes, and its checkpoint (safetensors)."""
+"""All that a run needs to resume with the very same bytes, and its checkpoint (safetensors)."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class TrainState:
     skipped: int = 0  # steps whose loss was not finite, and that changed nothing
     # (iteration, validation PSNR in dB) at each regular report so far
     looks: list[tuple[int, float]] = field(default_factory=list)
-    jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it went on
+    jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it continued
     exposure: Exposure | None = None  # gains of the training images; None where that part is off
 
     @property
@@ -160,7 +160,8 @@ def load_state(
         generator.set_state(tensors.pop("generator"))
         tensors = {name: value.to(device) for name, value in tensors.items()}
         backdrop = scalars.get("backdrop")
-        splats = Splats.of(_under("splats.", tensors), backdrop and Backdrop.of(backdrop))
+        splats = Splats.from_parameters(
+            _under("splats.", tensors), backdrop and Backdrop.from_numbers(backdrop))
         state = TrainState(
             SplatOptimizer(splats, config, means_unit, backend=backend),
             DensificationStats(**_under("gathered.", tensors)), generator,

@@ -81,8 +81,8 @@ def _refuse_tiny_units(scene: Scene) -> None:
     """Raises TrainingError where half of the scene lies in front of the rasterizer's near plane."""
     if scene.nearness < NEAR:
         raise TrainingError(
-            f"Half of the points are nearer than {scene.nearness:.2g} units to a camera, and what "
-            f"is nearer than {NEAR:g} is not drawn: the units of this scene are too large.",
+            f"Half of the points are nearer than {scene.nearness:.2g} units to a camera, but "
+            f"Gaussians nearer than {NEAR:g} are not drawn: the units of this scene are too large.",
             hint="Give it a scale with `recon sfm --scale-between A B METRES`, or scale the poses "
             "of the data set.")
 
@@ -112,7 +112,7 @@ def read_config(folder: Path) -> RunConfig:
     """Returns the options that `write_config` wrote.
 
     Raises:
-        FormatError: a version before this one wrote a value that is no longer known.
+        FormatError: a version before this one wrote a value that this one does not know.
     """
     path = folder / "config.json"
     values = read_json(path, dict, hint="Run `recon train --again`.")

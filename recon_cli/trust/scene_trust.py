@@ -66,7 +66,7 @@ class TrustRecord(JsonRecord):
     models: tuple[str, ...]
     base: ModelTrust | None = None
     pruned: ModelTrust | None = None
-    reason: str = ""  # why there is no trust; empty where there is
+    reason: str = ""  # why it was not measured; empty where it was
     metres: bool = False  # world units are metres
     poorly_seen: tuple[PoorlySeenRegion, ...] = ()  # of the model that export takes
 
@@ -84,7 +84,7 @@ class TrustRecord(JsonRecord):
         """Writes the record into evaluate's folder."""
         write_json(evaluate / FOLDER / RECORD, self.to_json())
 
-    def of(self, model: str) -> ModelTrust | None:
+    def model_trust(self, model: str) -> ModelTrust | None:
         """Returns what is said about base or pruned."""
         return {"base": self.base, "pruned": self.pruned}[model]
 
@@ -117,7 +117,7 @@ class Trust:
 
     def to_json(self) -> dict[str, Any]:
         """Returns what a 16-bit picture of it means, for readers and as its fingerprint."""
-        return {"unit": "expected mean absolute error of the channels, whole range = 1",
+        return {"unit": "expected mean absolute error of the channels, full range = 1",
                 "error_per_step": 1 / FULL, "views": len(self.support.rows),
                 "model": self.error.to_json()}
 
@@ -133,7 +133,7 @@ class Trust:
             record = TrustRecord.read(evaluate)
         except ManifestError:  # of another version
             return None
-        stored = record and record.of(model)
+        stored = record and record.model_trust(model)
         if not stored:
             return None
         support = Support.load(evaluate / FOLDER / f"{model}.safetensors")
@@ -210,7 +210,7 @@ def model_trust(
     `on_view` gets each of the `views` and its expected error [H, W].
     """
     areas: list[tuple[float, ...]] = []
-    real, thought = [], []
+    actual_error, expected_error = [], []
     for view in views:
         picture = picture_terms(
             splats, trust.support, view.camera, sh_degree=trust.sh_degree, backend=backend)
@@ -223,11 +223,11 @@ def model_trust(
         areas.append((ause(errors, own), *(
             ause(errors, np.asarray(image[used][pixels], np.float64))
             for image in (1 - picture.alpha, picture.depth))))
-        real.append(errors)
-        thought.append(own)
+        actual_error.append(errors)
+        expected_error.append(own)
     agreement = None
     if views:
-        bins, means = reliability(real, thought), np.mean(areas, axis=0)
+        bins, means = reliability(actual_error, expected_error), np.mean(areas, axis=0)
         agreement = Agreement(
             views=len(views), ause=round(float(means[0]), 4),
             ause_opacity=round(float(means[1]), 4), ause_depth=round(float(means[2]), 4),

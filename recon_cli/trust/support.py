@@ -51,7 +51,7 @@ class Support:
     digest: str = ""  # of the Gaussians
 
     @staticmethod
-    def of(
+    def from_rows(
         rows: Sequence[Tensor], centers: NDArray[np.float64], residual: Tensor, digest: str = ""
     ) -> Support:
         """Returns the support by `rows`, with the views of each Gaussian counted."""
@@ -122,7 +122,7 @@ class Support:
             raise FormatError(
                 f"{path} cannot be read: {error}.", hint="Run `recon eval --again`.") from error
         rows = tuple(torch.from_numpy(np.nonzero(row)[0]) for row in bits)
-        return Support.of(rows, centers.numpy(), residual, str(head["digest"]))
+        return Support.from_rows(rows, centers.numpy(), residual, str(head["digest"]))
 
 
 def _directions(means: Tensor, place: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
@@ -167,7 +167,7 @@ def measure_support(
         on_view()
     mean = float(errors.sum() / weights.sum().clamp_min(1e-12))
     residual = torch.where(weights > 0, errors / weights.clamp_min(1e-12), mean)
-    return Support.of(
+    return Support.from_rows(
         shown, np.reshape(centers, (-1, 3)), residual.to(splats.means.dtype), digest)
 
 

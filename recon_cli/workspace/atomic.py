@@ -30,7 +30,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     It is flushed before the rename, so that a crash leaves the old file or the new one.
     """
-    # shortened, so that it is no longer than a name may be
+    # shortened to the length that a name may have
     temporary = path.with_name(f".{path.name[:_NAME]}.tmp{os.getpid()}{path.suffix}")
     try:
         yield temporary
@@ -142,7 +142,7 @@ def read_text(path: Path) -> str:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no plain file, too large, or not UTF-8.
+        ValueError: it is not a plain file, too large, or not UTF-8.
     """
     return read_bytes(path, most=MAX_TEXT_BYTES).decode("utf-8")
 
@@ -152,7 +152,7 @@ def read_bytes(path: Path, *, most: int | None = None) -> bytes:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no plain file, or too large.
+        ValueError: it is not a plain file, or too large.
     """
     special = describe_special(path)  # before it is opened: a FIFO would wait for its writer
     if special:

@@ -1,10 +1,10 @@
-"""Digests of unfinished work, so that a run goes on from no file that was damaged meanwhile.
+"""Digests of unfinished work, so that a run does not continue from a damaged file.
 
 `.partial/<stage>.digests` lies beside the folder that a stage writes in. Before a file is put in
 place there, a line with its size and CRC-32 is added, and one without when it is there. A crash at
 any moment leaves each file as one of the last two lines of its name say, or not there yet. CRC-32
-takes a third of the time of SHA-256, and damage is no attack. Jobs that a stage shares out work in
-folders below `jobs`, perhaps on other machines, and keep digests of their own there.
+takes a third of the time of SHA-256, and damage is not an attack. Jobs that a stage shares out work
+in folders below `jobs`, perhaps on other machines, and keep digests of their own there.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def expect_growth(path: Path) -> None:
 
 
 def find_damage(folder: Path) -> str:
-    """Returns in words what is damaged in unfinished work; empty if a run can go on from it.
+    """Describes the damage of unfinished work; empty if a run can continue it.
 
     What has no digest was not finished, and is deleted, as is what was appended to a file since.
     """

@@ -115,7 +115,7 @@ class Workspace:
         damaged since. A stage with `own_digests` finds that out by itself.
 
         Raises:
-            WorkspaceError: a folder that is no result has the name of the stage.
+            WorkspaceError: a folder that recon did not write has the name of the stage.
         """
         self._refuse_foreign(key.stage)
         partial, earlier = self.partial(key.stage), self.partial_run(key.stage)
@@ -137,7 +137,7 @@ class Workspace:
         return partial, fresh
 
     def _doubt(self, key: ResultKey, earlier: PartialRun | None, *, own_digests: bool) -> str:
-        """Returns why a run does not go on from unfinished work; empty if it does, or has none."""
+        """Returns why a run does not continue unfinished work; empty if it does, or has none."""
         partial = self.partial(key.stage)
         if earlier is None:
             return f"the record of it at {self._record(key.stage)} is missing or damaged" * (
@@ -224,11 +224,11 @@ class Workspace:
                 continue
             damage = find_changed_outputs(partial, Manifest.read(partial), ())
             if damage:
-                logger.warning("%s: what a crash interrupted was damaged since (%s), and is "
-                               "discarded", partial.name, "; ".join(damage))
+                logger.warning("%s: work interrupted by a crash was damaged since (%s), and "
+                               "is discarded", partial.name, "; ".join(damage))
                 self.discard(partial.name)
             else:
-                logger.info("%s: finishing what a crash interrupted", partial.name)
+                logger.info("%s: finishing work that a crash interrupted", partial.name)
                 self._swap(partial.name)
         for old in _folders(self.root / _OLD):
             if not self.folder(old.name).exists() and _complete(old):

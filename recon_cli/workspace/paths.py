@@ -16,7 +16,7 @@ _KINDS = {
 
 
 def is_plain_file(path: Path) -> bool:
-    """Returns whether there is a file that is no link, which another process may have put there."""
+    """Returns whether a file exists and is not a link, which another process may have put there."""
     try:
         return stat.S_ISREG(os.lstat(path).st_mode)
     except OSError:
@@ -39,7 +39,7 @@ def refuse_special(path: Path) -> None:
     if kind:
         raise FormatError(
             f"{path} is {kind}, not a file.",
-            hint="Save what it gives to a file, and give the path of that.")
+            hint="Save its output to a file, and give the path of that file.")
 
 
 def describe_special(path: Path) -> str:

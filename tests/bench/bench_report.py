@@ -79,7 +79,7 @@ def large(workspace: Path, views: int) -> str:
             for index in range(len(frames), views):
                 (root / place / f"{index}.png").symlink_to(
                     root / place / f"{index % len(frames)}.png")
-        model = ModelMetrics.of(
+        model = ModelMetrics.from_views(
             tuple(ViewScore(f"{i}.png", i, i, 1.0, 1.0) for i in range(views)), gaussians=1,
             bytes=1, render_ms=1.0)
         metrics = Metrics(

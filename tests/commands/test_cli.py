@@ -170,7 +170,7 @@ def test_status_as_json_has_stable_keys(capsys: Said) -> None:
 
 def test_status_needs_no_workspace_and_makes_none(capsys: Said) -> None:
     assert main(["status", "-w", "none"]) == 0
-    assert "there is no workspace" in capsys.readouterr().err
+    assert "no workspace at" in capsys.readouterr().err
     assert not Path("none").exists()
 
 

@@ -44,7 +44,7 @@ def test_a_rounded_rotation_is_made_orthonormal():
 def test_a_scaled_pose_is_refused_with_its_scale(angle, scale):
     scaled = np.eye(4)
     scaled[:3, :3] = scale * turn(angle)
-    with pytest.raises(FormatError, match=f"frame 7 is no rigid pose: scaled by {scale:.4g}"):
+    with pytest.raises(FormatError, match=f"frame 7 is not a rigid pose: scaled by {scale:.4g}"):
         viewmat_from_pose(scaled, "frame 7")
 
 

@@ -10,7 +10,7 @@ from recon_cli.render import resolve, self_check
 from recon_cli.render.registry import cuda_verdict
 from recon_cli.render.self_check import Verdict
 
-FAILURE = "gradient of quats, hard scene: error 312 times what is allowed"
+FAILURE = "gradient of quats, hard scene: error 312 times the allowed difference"
 
 
 def test_auto_names_what_will_run():

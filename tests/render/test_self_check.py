@@ -13,7 +13,8 @@ from recon_cli.render.self_check import Candidate, StepResult, Verdict, check, n
 
 CPU = torch.device("cpu")
 SIZE = {"count": 60, "width": 40, "height": 30}
-FAILED = Verdict("triton", "a GPU", "rgb, hard scene: error 7 times what is allowed", {}, 1.0)
+FAILED = Verdict(
+    "triton", "a GPU", "rgb, hard scene: error 7 times the allowed difference", {}, 1.0)
 PASSED = Verdict("triton", "a GPU", "", {"rgb, hard scene": 0.01}, 1.0)
 
 

@@ -116,7 +116,7 @@ def test_files_and_cameras_that_are_handed_out_show_the_same_pictures(inputs, op
 
 
 def test_harmonics_that_did_not_turn_would_be_seen(inputs):
-    """The bound above is no bound at all unless this fails it."""
+    """The bound above means nothing unless this exceeds it."""
     out, _ = exported(inputs, format="colmap", transform=flat(MOVED))
     before = pictures(read_ply(inputs.folders["train"] / "splats.ply"),
                       of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse"))

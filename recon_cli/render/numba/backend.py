@@ -66,7 +66,7 @@ def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
     lease = Lease()
     rows = torch.empty(camera.height, camera.width, dtype=torch.int32)
     lease.view_pass.crossing(
-        PackedSplats.of(splats.parameters().values()), camera,
+        PackedSplats.from_tensors(splats.parameters().values()), camera,
         RenderSettings(np.zeros(3, np.float32), 0), level, rows.view(-1).numpy(),
         Statistics.zeros(splats.means.detach()))
     return rows.long()
@@ -92,7 +92,7 @@ class _Render(torch.autograd.Function):
                              background.new_empty(size))
         lease = Lease()
         lease.view_pass.forward(
-            PackedSplats.of(tensors), camera, settings,
+            PackedSplats.from_tensors(tensors), camera, settings,
             ImageBuffers(flat(rgb), flat(alpha), flat(depth)), statistics)
         ctx.save_for_backward(*tensors)
         ctx.lease, ctx.statistics, ctx.scores = lease, statistics, settings.scores
@@ -108,7 +108,7 @@ class _Render(torch.autograd.Function):
         gradients = [torch.empty_like(tensor, memory_format=torch.contiguous_format)
                      for tensor in tensors]
         ctx.lease.view_pass.backward(
-            PackedSplats.of(tensors), PackedSplats.of(gradients),
+            PackedSplats.from_tensors(tensors), PackedSplats.from_tensors(gradients),
             ImageBuffers(flat(grad_rgb), flat(grad_alpha), flat(grad_depth)), ctx.statistics,
             details=True, loo=ctx.scores)
         grad_background = None

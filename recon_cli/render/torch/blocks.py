@@ -92,7 +92,7 @@ class InstanceLists:
     gaussians: Tensor  # [E+1] row in the table by position; the last one is the empty row
 
     @staticmethod
-    def of(instances: Instances) -> InstanceLists:
+    def from_instances(instances: Instances) -> InstanceLists:
         """Returns the lists of some instances."""
         empty_row = len(instances.per_gaussian)
         gaussians = torch.nn.functional.pad(instances.gaussians, (0, 1), value=empty_row)

@@ -71,7 +71,7 @@ def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
     rows = torch.full(transmittance.shape, -1, dtype=torch.int64, device=means2d.device)
     monomials, scratch = pixel_monomials(means2d)[:3], Scratch(means2d)
     ids = torch.nn.functional.pad(projection.ids, (0, 1), value=-1)
-    lists = InstanceLists.of(instances)
+    lists = InstanceLists.from_instances(instances)
     for tiles in lists.groups():
         for block in lists.walk(tiles, transmittance):
             affine = whitening_of(table, block, instances.tiles_x)
@@ -115,7 +115,7 @@ class _Rasterize(torch.autograd.Function):
         if view.scores and view.mask is not None:
             counting = _to_tiles(view.mask.to(means2d)[..., None], instances)[..., 0]
         tally = _Tally(instances, means2d, counting) if view.scores else None
-        lists = InstanceLists.of(instances)
+        lists = InstanceLists.from_instances(instances)
 
         def composite_group(tiles: Tensor) -> list[Block]:
             blocks = []
@@ -222,7 +222,7 @@ def _leave_one_out(
         weighted = own * odds
         later = torch.matmul(upper, weighted) + composited[block.tiles, None, :, channel]
         composited[block.tiles, :, channel] += weighted.sum(1)
-        # `later` still counts what lies behind a stopped pixel; there the Gaussian is no part
+        # `later` still counts what lies behind a stopped pixel; there the Gaussian is not part
         total += (((own - later) * odds) ** 2 * part).sum(-1)
     return total
 

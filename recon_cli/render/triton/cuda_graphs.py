@@ -38,7 +38,7 @@ class Graphs:
         self._recorded: dict[Hashable, Work] = {}
 
     @staticmethod
-    def of(device: torch.device) -> Graphs:
+    def for_device(device: torch.device) -> Graphs:
         """Returns CUDA graphs on a CUDA device, and no recording elsewhere."""
         return Graphs(_CudaGraphs(device) if device.type == "cuda" else None)
 
@@ -60,7 +60,7 @@ class Graphs:
             try:
                 self._recorded[key] = self._recorder(work)
             except RuntimeError as error:  # the driver's, of whatever kind; nothing was done yet
-                logger.warning("training goes on without CUDA graphs, more slowly: %s", error)
+                logger.warning("training continues without CUDA graphs, more slowly: %s", error)
                 self._recorder = None
                 work()
                 return

@@ -17,7 +17,7 @@ INFINITE = tl.constexpr(float("inf"))
 
 @triton.jit(do_not_specialize=("count", "room"))
 def admit_kernel(ends, count, room, status, starts, fits, BLOCK: tl.constexpr):
-    """Lets a step go on if its instances fit into `room` and no step before it was stopped.
+    """Lets a step continue if its instances fit into `room` and no step before it was stopped.
 
     Every program decides the same; the first one writes it into `fits` [1] int32. From `ends`
     [count + 1] int64, see `passes.ProjectedSplats`, come `starts` [count + 1] int32, all zero where
