@@ -169,5 +169,5 @@ def _known(error: BaseException) -> ReconError | None:
 
 
 def _signalled(error: BaseException) -> BaseException | None:
-    """Returns what interrupted a command; click passes it on as an Abort."""
+    """Returns the exception that interrupted a command; click passes it on as an Abort."""
     return error.__cause__ if isinstance(error, click.Abort) else error

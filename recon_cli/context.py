@@ -1,4 +1,4 @@
-"""What a stage is given beside its config: where to read, how to report, what to compute on."""
+"""The inputs of a stage beside its config: folders to read, reporting, device and backend."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TrainReport:
 
 
 class TrainCallback:
-    """Is called between the steps of a training; may read what it is given and change nothing.
+    """Is called between the steps of a training; may read its arguments and change nothing.
 
     By default it does nothing. What takes long belongs elsewhere, and an exception ends the fit.
     """
@@ -77,7 +77,7 @@ class EarlierResult:
 
 @dataclass(frozen=True)
 class StageInputs:
-    """What a stage may read."""
+    """The folders and files that a stage may read."""
 
     # finished folder by stage name: of all in `needs`, and of those in `uses` that are fresh
     folders: Mapping[str, Path] = field(default_factory=dict)

@@ -45,7 +45,7 @@ def describe_end(error: BaseException | None) -> str:
 
 
 class _Watch:
-    """What has become of the signals so far."""
+    """The signals received so far."""
 
     def __init__(self) -> None:
         self.number = 0  # of the first one

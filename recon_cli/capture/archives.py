@@ -80,7 +80,7 @@ def _ingest_beside(path: Path) -> str:
 
 
 def _unpacking(path: Path) -> str | None:
-    """Returns what unpacks an archive, None for other files."""
+    """Returns the command that unpacks an archive, None for other files."""
     with suppress(OSError):
         if path.is_file():
             with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""What is measured of every frame: sharpness, exposure, and how far the view moved."""
+"""Measures of every frame: sharpness, exposure, and how far the view moved."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def _find_sequence(
 
 
 def _visible_tracks(taken: _TakenPhotos, frames: Sequence[Frame], out: Path) -> Tracks | None:
-    """Returns the tracks through the frames, without what their masks hide."""
+    """Returns the tracks through the frames, without masked points."""
     tracks = taken.tracks
     if tracks is None:
         return None
@@ -141,13 +141,13 @@ class _PhotoSource:
     names: tuple[str, ...]  # of their frames
     masks: Mapping[str, Path]  # by file name
     plan: RawPlan
-    broken: Mapping[str, str]  # why other files are no photos, by file name
+    broken: Mapping[str, str]  # why other files are not photos, by file name
     white: int  # the brightest value of those with 16 bits
 
 
 @dataclass(frozen=True)
 class _TakenPhotos:
-    """What became of the photos of a folder."""
+    """The decisions on the photos of a folder."""
 
     record: Record
     broken: Mapping[str, str]  # why some cannot be read, by file name
@@ -205,7 +205,7 @@ def _take_from_sequence(
 def _choose_followed(
     config: IngestConfig, source: _PhotoSource, sequence: PhotoSequence, ctx: IngestContext
 ) -> tuple[dict[int, FrameCandidate], Tracks]:
-    """Returns what becomes of the photos of a sequence, by place, and the tracks through them."""
+    """Returns the decisions on the photos of a sequence, by place, and the tracks through them."""
     count = config.frames or frame_selection.automatic_count(
         frame_selection.path_length(sequence.scan.motion), most=config.max_frames, least=MIN_KEPT)
     video = judge(config, source.path, sequence.scan, ctx, least=count)
@@ -268,7 +268,7 @@ def _list_photos(
 
 
 def _describe_beside(paths: Sequence[Path], home: Path) -> list[str]:
-    """Returns what lies beside photos that were given as files, and is not used."""
+    """Returns the unused files that lie beside photos that were given as files."""
     if len({path.absolute().parent for path in paths}) > 1:
         return []
     masks = [f"{folder} is not used with files; give {home} to use it."

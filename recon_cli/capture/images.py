@@ -1,6 +1,6 @@
 """One photo: its upright size, its lens by EXIF, and its pixels as 8-bit RGB.
 
-Pillow reads photos, LibRaw the headers of camera RAW. A photo is read whole or refused with an
+Pillow reads photos, LibRaw the headers of camera RAW. A photo is read completely or refused with an
 InputError. Colours become sRGB by the embedded profile.
 """
 
@@ -84,7 +84,7 @@ class Photo:
 
     @property
     def name(self) -> str:
-        """What it is called in messages and records, unique within a capture."""
+        """Its name in messages and records, unique within a capture."""
         return self.label or self.path.name
 
     @property

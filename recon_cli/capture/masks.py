@@ -122,7 +122,7 @@ def photo_mask(
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
-    """Writes a mask [H, W] as 8-bit gray PNG, whole or not at all, and makes its folder."""
+    """Writes a mask [H, W] as 8-bit gray PNG, atomically, and makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(".png", mask)
     atomic.write_bytes(path, data.tobytes())

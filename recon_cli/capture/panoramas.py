@@ -1,4 +1,4 @@
-"""360-degree panoramas among photos: told by their metadata, or by what they show.
+"""360-degree panoramas among photos: told by their metadata, or by their content.
 
 A panorama is not taken by a pinhole camera: treated as such it gives wrong cameras or none.
 """

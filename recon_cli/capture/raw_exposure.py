@@ -43,7 +43,7 @@ class RawMeasures:
     """Measures of a small linear view of a photo; the views themselves would fill the memory."""
 
     points: NDArray[np.float32]  # [K, 2], its key points in pixels of the view
-    descriptors: NDArray[np.uint8]  # [K, 128], SIFT in whole numbers
+    descriptors: NDArray[np.uint8]  # [K, 128], SIFT as integers
     levels: NDArray[np.float64]  # [K], log2 of the mean green around, NaN if clipped or too dark
     brightest: NDArray[np.float32]  # [P], highest channel, 1 for saturation, infinite if clipped
 

@@ -52,7 +52,7 @@ NAMES = {
 
 @contextmanager
 def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Yields the container and the video stream of a file, whatever its suffix.
+    """Yields the container and the video stream of a file with any suffix.
 
     InputError if the file is missing, not readable, no video, or a single picture.
     """

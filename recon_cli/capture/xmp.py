@@ -1,4 +1,4 @@
-"""What a picture's XMP says of its projection, as cameras and stitchers of panoramas write it."""
+"""Reads a picture's projection from its XMP, as cameras and stitchers of panoramas write it."""
 
 from __future__ import annotations
 

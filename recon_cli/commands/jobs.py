@@ -91,7 +91,7 @@ def report_outcome(outcome: Outcome) -> None:
 def open_executor(
     place: str, jobs: int | None, compute: ComputeConfig, folder: Path, inputs: Sequence[Path] = ()
 ) -> tuple[Executor, int]:
-    """Returns what runs commands on `folder`, and how many threads each of them has."""
+    """Returns the executor of commands on `folder`, and how many threads each command has."""
     return start_executor(
         place, folder, inputs=inputs, slots=jobs, cores=compute.threads,
         gpu=NEEDS_GPU[compute.device])

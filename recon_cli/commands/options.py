@@ -42,7 +42,7 @@ _METAVARS = {int: "N", float: "X", str: "TEXT"}
 
 @dataclass
 class Call:
-    """What was typed, collected option by option."""
+    """The typed command line, collected option by option."""
 
     workspace: Path = Path("workspace")  # of -w, RECON_WORKSPACE or the default
     config_file: Path | None = None
@@ -128,7 +128,7 @@ class Option(click.Option):
         return (f"--[no-]{self.opts[0][2:]}" if self.secondary_opts else name), text
 
     def get_help_extra(self, ctx: click.Context) -> OptionHelpExtra:
-        """Returns what click adds in brackets; the range of a number on the second page alone."""
+        """Returns click's additions in brackets; the range of a number on the second page alone."""
         extra = super().get_help_extra(ctx)
         if HELP_ALL not in ctx.meta:
             extra.pop("range", None)
@@ -141,7 +141,7 @@ def verb(name: str) -> Callable[[Command], Verb]:
 
 
 def explicit_settings(call: Call) -> Settings:
-    """Returns what recon.toml, --config and --set set; ConfigError if a value cannot be used."""
+    """Returns the values of recon.toml, --config and --set; ConfigError if one cannot be used."""
     in_workspace = call.workspace / FILE
     # A link that leads nowhere is an error, not the same as none.
     files = [in_workspace] if os.path.lexists(in_workspace) else []

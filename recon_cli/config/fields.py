@@ -17,12 +17,12 @@ from typing import Any, get_args, get_origin, get_type_hints
 from recon_cli.errors import ConfigError
 
 _SHOWN = 100  # characters of a value
-MOST = 2**31 - 1  # of any whole number: what COLMAP and others hold
+MOST = 2**31 - 1  # of any integer: the limit of COLMAP and others
 
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """What is declared about a field besides its type and default."""
+    """The declaration of a field besides its type and default."""
 
     help: str  # one sentence
     unit: str = ""

@@ -148,7 +148,7 @@ def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> Non
         SECTIONS[section](**values)
     except ConfigError as error:
         raise ConfigError(f"{where}{error.message}", hint=error.hint) from error
-    except OverflowError as error:  # a whole number for a float
+    except OverflowError as error:  # an integer for a float
         raise ConfigError(
             f"{where.rstrip('.')}: a number has too many digits.",
             hint="Write a smaller one.") from error

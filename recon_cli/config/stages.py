@@ -164,7 +164,7 @@ DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 @dataclass(frozen=True)
 class TrainConfig(StageConfig):
-    """How Gaussians are fitted; `train.plan` decides what is left automatic for a scene."""
+    """How Gaussians are fitted; `train.plan` decides automatic values for a scene."""
 
     quality: str = option(
         "normal", "Preset: 1500, 2400 or 8000 steps at 400, 600 or 800 pixels.",
@@ -259,7 +259,7 @@ class TrainConfig(StageConfig):
 
 @dataclass(frozen=True)
 class RunConfig(TrainConfig):
-    """TrainConfig with numbers in place of what was automatic, as `train.plan` makes it."""
+    """TrainConfig with numbers in place of automatic values, as `train.plan` makes it."""
 
     iterations: int = option(2400, "Optimization steps.", minimum=1)
     max_size: int = option(600, "Longest image side.", unit="pixels", minimum=16)
@@ -268,7 +268,7 @@ class RunConfig(TrainConfig):
 
     @property
     def is_reference(self) -> bool:
-        """Whether this is the recipe of 3DGS (Kerbl et al. 2023), whatever the steps and images."""
+        """Whether this is the recipe of 3DGS (Kerbl et al. 2023), with any steps and images."""
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
                  "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
                  "sh_rate")

@@ -65,7 +65,7 @@ def is_tum(folder: Path) -> bool:
 
 
 def find_unposed(folder: Path) -> tuple[str, Path] | None:
-    """Returns what a folder of colours and depth without poses lacks, and what to give instead."""
+    """Returns the files that colours and depth without poses lack, and a better input."""
     if not is_seven_scenes(folder) and folder.is_dir() and all(
             next(folder.glob(f"frame-*.{kind}.*"), None) for kind in ("color", "depth")):
         return "7-Scenes frames without their .pose.txt", folder / "frame-*.color.*"

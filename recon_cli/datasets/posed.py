@@ -1,4 +1,4 @@
-"""Data sets with known cameras: what their readers return, and the files that they list.
+"""Data sets with known cameras: the records of their readers, and the files that they list.
 
 A reader lists images with lenses and poses; `find_images` keeps those whose file exists, each with
 a lens of its size, as a `PosedSet`.
@@ -70,7 +70,7 @@ def _read_depth(path: Path) -> NDArray[np.generic]:
         if path.suffix.lower() == ".npy":
             values = np.asarray(np.load(path, allow_pickle=False))
         else:
-            # Not OpenCV, which returns the first rows of a damaged PNG as the whole.
+            # Not OpenCV, which returns the first rows of a damaged PNG without an error.
             with Image.open(path, formats=("PNG", "TIFF")) as image:
                 values = np.asarray(image)
     except (OSError, ValueError, EOFError, SyntaxError, struct.error, zlib.error) as error:

@@ -194,7 +194,7 @@ def _files(path: Path) -> list[tuple[Path, str | None]]:
 
 
 def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Returns what a file says of all frames, and its entries."""
+    """Returns a file's values for all frames, and its entries."""
     value = read_json(file, hint=_HINT, finite=False)
     entries = value.get("frames") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
@@ -336,7 +336,7 @@ def write_transforms(
     path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = (),
     points: str | None = None,
 ) -> None:
-    """Writes the cameras of images, by paths below the folder of the file, whole or not at all.
+    """Writes the cameras of images, by paths below the folder of the file, atomically.
 
     Intrinsics that all cameras share are written once. With held-out paths the lists
     train_filenames, val_filenames and test_filenames are written; the last two are those images,

@@ -80,7 +80,7 @@ class ModelMetrics(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics(JsonRecord):
-    """What evaluate leaves in metrics.json."""
+    """The content of metrics.json."""
 
     FILE: ClassVar[str] = "metrics.json"
 

@@ -1,4 +1,4 @@
-"""Reads the trained scene of a workspace: a model, its views, and what is known of the world."""
+"""Reads the trained scene of a workspace: a model, its views, and the facts on the world."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def to_uint8(image: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Writes [H, W, 3] RGB or [H, W] gray of 8 or 16 bits as PNG, whole or not at all."""
+    """Writes [H, W, 3] RGB or [H, W] gray of 8 or 16 bits as PNG, atomically."""
     ordered = image[:, :, ::-1] if image.ndim == 3 else image
     encoded, data = cv2.imencode(".png", np.ascontiguousarray(ordered))
     if not encoded:

@@ -36,7 +36,7 @@ class Mesh:
 
 
 def write_mesh(path: Path, mesh: Mesh, *, axes: NDArray[np.float64] | None = None) -> None:
-    """Writes a mesh in the format of the file's suffix, whole or not at all.
+    """Writes a mesh in the format of the file's suffix, atomically.
 
     `axes` [3, 3] are the axes of the file in those of the mesh, as in `glb.write_glb`.
     """
@@ -80,7 +80,7 @@ def _glb_bytes(
 def write_point_cloud(
     path: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]
 ) -> None:
-    """Writes points [P, 3] with RGB colours [P, 3] as a .ply, whole or not at all."""
+    """Writes points [P, 3] with RGB colours [P, 3] as a .ply, atomically."""
     write_bytes(path, trimesh.PointCloud(points.astype(np.float32), colors).export(file_type="ply"))
 
 

@@ -116,7 +116,7 @@ class RayExecutor:
             hint="Start the cluster again and repeat the same command: finished work is kept.")
 
     def stop(self) -> None:
-        """Interrupts what runs; see `Executor`."""
+        """Interrupts the commands; see `Executor`."""
         with self._lock:
             self._stopped = True
             for reference in self._running:
@@ -179,7 +179,7 @@ def _run_command(words: list[str], workspace: str, log: str) -> int:
 
 
 def _probe(folder: str, name: str, token: str, inputs: list[str]) -> dict[str, Any]:
-    """Returns what a machine has and sees."""
+    """Returns the resources and files that a machine has."""
     path = Path(folder) / name
     try:
         sees = path.read_text(encoding="utf-8") == token

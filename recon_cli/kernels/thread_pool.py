@@ -112,7 +112,7 @@ def _work(inbox: SimpleQueue[Callable[[], None]], wake: SimpleQueue[None]) -> No
 
 
 def _failure_of(call: Callable[[int], None], number: int) -> BaseException | None:
-    """Returns what a call raises, to be raised in the thread that waits."""
+    """Returns the exception of a call, to be raised in the thread that waits."""
     try:
         call(number)
     except BaseException as error:

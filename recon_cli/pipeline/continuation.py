@@ -30,7 +30,7 @@ logger = logging.getLogger("recon")
 
 
 class Start(Enum):
-    """What a run starts from."""
+    """The start of a run: anew, a finished run or an imported scene."""
 
     AUTO = "auto"  # a finished run that it prolongs, else nothing
     ANEW = "anew"  # nothing
@@ -107,7 +107,7 @@ def find_start(workspace: Workspace, row: Stage, key: ResultKey, start: Start) -
 
 
 def _resumes(workspace: Workspace, partial: PartialRun, key: ResultKey) -> bool:
-    """Returns whether an interrupted run is the one of `key`, from whatever it started."""
+    """Returns whether an interrupted run is the one of `key`, with any start."""
     same = dataclasses.replace(key, continues=partial.key.continues)
     return may_resume(workspace, partial) and partial.key.fingerprint == same.fingerprint
 

@@ -1,4 +1,4 @@
-"""Runs one stage: gives it a folder, a device and its inputs, and commits what it writes."""
+"""Runs one stage: gives it a folder, a device and its inputs, and commits its output."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _without(key: ResultKey, options: Sequence[str]) -> str:
 
 @contextmanager
 def importing_ahead(job: Job) -> Iterator[Callable[[], None]]:
-    """Yields a function that imports, in a thread, what the stages need that render: seconds.
+    """Yields a function that imports, in a thread, the modules of rendering stages: seconds.
 
     Kernels that are compiled are loaded, too.
 

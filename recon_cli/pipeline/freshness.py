@@ -1,4 +1,4 @@
-"""Whether a result is still what a run would make now, and if not, why.
+"""Whether a run would make the same result now, and if not, why.
 
 A result is compared with the options it was made with, except where recon.toml, --config or --set
 say otherwise. After `recon train --iterations 100`, `recon eval` finds the training fresh although
@@ -34,7 +34,7 @@ from recon_cli.workspace.manifest import (
 
 @dataclass(frozen=True)
 class StageCheck:
-    """What is known of one stage's result."""
+    """The state of one stage's result."""
 
     row: Stage  # the stage
     manifest: Manifest | None  # of the finished result; None where there is none
@@ -143,7 +143,7 @@ class WorkspaceCheck:
             return layers.build(row.config, self._settings)
 
     def upstream(self, row: Stage) -> dict[str, str | None]:
-        """Returns the digests of what a stage reads; None for what is missing or left out."""
+        """Returns the digests of a stage's inputs; None for those that are missing or left out."""
         digests: dict[str, str | None] = {}
         for name in (*row.needs, *row.uses):
             check = self.check(name)

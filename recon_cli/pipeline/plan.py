@@ -92,7 +92,7 @@ def _status(check: StageCheck) -> StageStatus:
 def run(
     job: Job, verb: str, targets: Sequence[Target], *, again: bool = False
 ) -> tuple[Outcome, ...]:
-    """Brings every target up to date, in order, and returns what was done for each.
+    """Brings every target up to date, in order, and returns the outcome of each.
 
     Fresh targets run only with `again`, which also discards their unfinished work. `verb` is shown
     to processes that want the workspace.
@@ -122,7 +122,7 @@ def run(
 
 
 def _raise_failure(job: Job, outcome: Outcome) -> None:
-    """Raises what a stage that has run did not achieve, though its result is worth keeping."""
+    """Raises the failure of a stage that has run, though its result is worth keeping."""
     if not outcome.ran:
         return
     row = next(row for row in job.table if row.name == outcome.stage)
@@ -189,7 +189,7 @@ def require_fresh(job: Job, stages: Sequence[str]) -> None:
 
 
 def command(checks: WorkspaceCheck, check: StageCheck) -> str:
-    """Returns what to type to bring a stage up to date with the options it had."""
+    """Returns the command that brings a stage up to date with the options it had."""
     words = ["recon", check.row.verb]
     latest = check.partial_run or check.manifest
     if latest is None:
@@ -213,7 +213,7 @@ def _option_words(name: str, value: Any, info: OptionInfo) -> list[str]:
 
 
 def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outcome]:
-    """Runs what a target needs and then the target, and yields every stage that is done."""
+    """Runs the needs of a target and then the target, and yields every stage that is done."""
     checks = job.inspect()
     row = checks.row(target.stage)
     sources = _read_sources(job, target)
@@ -274,12 +274,12 @@ class _LogFile(logging.FileHandler):
     """The log in the workspace: where the disk is full, lines are lost without a message."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  # logging's name
-        """Leaves a failure to write to what has to be written."""
+        """Ignores a failure to write: files that matter report their own."""
         if not isinstance(sys.exception(), OSError):
             super().handleError(record)
 
     def close(self) -> None:
-        """Closes the file; what is still to be written may not fit."""
+        """Closes the file; the rest of the buffer may not fit."""
         with suppress(OSError):
             super().close()
 
@@ -317,7 +317,7 @@ class Freed:
 
 
 def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:
-    """Removes what can be spared and returns it; with `dry` nothing is removed.
+    """Removes dispensable files and returns them; with `dry` nothing is removed.
 
     That is unfinished work, replaced results and large volatile files, or the results of `stages`.
     Nothing is removed through a link.

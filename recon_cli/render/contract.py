@@ -47,7 +47,7 @@ _ALIGNED = 64  # numbers: kernels are compiled anew for addresses that are align
 
 @dataclass(eq=False)
 class Statistics:
-    """What densification and pruning need, gathered by the same passes that render.
+    """Statistics for densification and pruning, gathered by the same passes that render.
 
     Pixels that a mask ignores are drawn, but do not count in hits, blend_sum, blend_max and loo.
     The gradients, variance and loo are zeros until backward() has run.
@@ -93,7 +93,7 @@ class RenderOutput:
 
 @dataclass(frozen=True, eq=False)
 class TargetImage:
-    """What a training step compares a rendered view with."""
+    """The image that a training step compares a rendered view with."""
 
     pixels: NDArray[np.uint8]  # [H, W, 3]
     mask: NDArray[np.bool_] | None = None  # [H, W] True where a pixel counts; None: everywhere
@@ -102,7 +102,7 @@ class TargetImage:
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What a training step without autograd computes."""
+    """The outputs of a training step without autograd."""
 
     sh_degree: int  # highest in use, as in `recon_cli.render.registry.render`
     ssim_weight: float  # w in [0, 1] of the loss (1 - w) L1 + w (1 - SSIM)

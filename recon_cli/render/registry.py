@@ -69,7 +69,7 @@ def cuda_verdict() -> Verdict | None:
 
 
 def resolve(backend: str, device: str) -> tuple[str, str]:
-    """Returns (backend, device) with every `auto` replaced by what will run.
+    """Returns (backend, device) with every `auto` replaced by the actual choice.
 
     On CUDA `auto` takes triton only where its kernels passed the self-check on this GPU. A backend
     that was named runs even where it failed, with a warning: it may be the check that is wrong.

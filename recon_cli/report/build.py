@@ -114,7 +114,7 @@ def build_report(job: Job) -> bytes:
 def _template_values(
     job: Job, stages: StageReports, metrics: Metrics | None, damaged: str
 ) -> dict[str, Any]:
-    """Returns what the template shows, except for the views."""
+    """Returns the template's values, except for the views."""
     root = job.workspace.root
     runs = [stage.manifest.run for stage in stages.values() if stage.manifest]
     return {

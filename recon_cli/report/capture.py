@@ -50,7 +50,7 @@ MISSING = {"other part": (4, "triangle"), "left out": (1, "plus"), "lost": (3, "
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureSection:
     """The section on the capture; pictures are data URIs."""
 
     sheets: tuple[Markup, ...]  # contact sheets
@@ -65,7 +65,7 @@ class Capture:
     damaged: tuple[str, ...]  # why something is not shown
 
 
-def read_capture(stages: StageReports) -> Capture:
+def read_capture(stages: StageReports) -> CaptureSection:
     """Returns the capture of a workspace, as far as its files can be read."""
     ingest = stages["ingest"]
     damaged: list[str] = []
@@ -104,7 +104,7 @@ def read_capture(stages: StageReports) -> Capture:
         **{name: "other part" for part in (sfm.parts if sfm else ()) for name in part.names},
         **dict.fromkeys(left_out, "left out")}
     parts = [by_name.get(frame.name, missing.get(frame.name, "lost")) for frame in frames]
-    return Capture(
+    return CaptureSection(
         tuple(sheets), more, tuple(overlays), tuple(thumbs), plan, notes,
         _draw_strip(frames, parts) if frames else None, _describe_left_out(frames, left_out),
         _draw_legend(parts) if frames else None, tuple(damaged))

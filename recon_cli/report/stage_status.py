@@ -60,7 +60,7 @@ class StageReport:
 
     @property
     def stale_suffix(self) -> str:
-        """What a label of its figures ends with: nothing where they are fresh."""
+        """The suffix of its figures' labels: empty where they are fresh."""
         return "" if self.fresh else " (stale)"
 
 
@@ -145,7 +145,7 @@ def read_provenance(stages: StageReports) -> Provenance:
 
 
 def read_decisions(train: StageReport) -> tuple[TrialDecision, ...]:
-    """Returns what training decided about each optional part; empty if unreadable."""
+    """Returns training's decision on each optional part; empty if unreadable."""
     try:
         return TrainPlan.read(train.folder).needs if train.there else ()
     except (FormatError, ManifestError):

@@ -25,7 +25,7 @@ _PICTURES, _SIDE, _QUALITY = 6, 480, 72
 
 @dataclass(frozen=True)
 class TrustSection:
-    """What the page says about trust."""
+    """The section on trust."""
 
     missing: str  # why there is nothing, as a sentence; empty where there is
     headline: str = ""  # share of the surface that is well seen
@@ -39,7 +39,7 @@ class TrustSection:
 
 
 def read_record(stages: StageReports) -> TrustRecord | None:
-    """Returns what evaluate left about trust; None without it. FormatError if it is damaged."""
+    """Returns evaluate's record on trust; None without it. FormatError if it is damaged."""
     stage = stages["evaluate"]
     if not stage.there:
         return None

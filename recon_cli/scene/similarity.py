@@ -82,7 +82,7 @@ class Similarity:
 
     @classmethod
     def from_matrix(cls, matrix: NDArray[np.float64]) -> Similarity:
-        """Returns the similarity that a matrix [4, 4] stands for; what rounding left is made good.
+        """Returns the similarity of a matrix [4, 4], with rounding errors repaired.
 
         Raises:
             ValueError: it stretches, shears or mirrors, is not finite, or is not affine.
@@ -114,7 +114,7 @@ class Similarity:
         """Returns what `to_json` wrote.
 
         Raises:
-            ValueError: the values are no similarity.
+            ValueError: the values are not a similarity.
             KeyError: one is missing.
         """
         return cls(

@@ -45,7 +45,7 @@ class Walls:
 
     along: NDArray[np.float64]  # [3] horizontal unit vector; the other one is at right angles
     strength: float  # how much sharper the points line up along it than along a middling direction
-    found: bool  # whether that is enough to be no accident
+    found: bool  # whether that is enough to rule out chance
 
 
 def find_floor(
@@ -101,7 +101,7 @@ def find_walls(points: NDArray[np.float64], up: NDArray[np.float64]) -> Walls:
 
 
 def _near(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Returns the points that are no strays, and the median distance from their middle."""
+    """Returns the points without strays, and the median distance from their middle."""
     if not len(points):
         return points, 0.0
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)

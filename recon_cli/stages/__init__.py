@@ -33,7 +33,7 @@ from recon_cli.workspace.summaries import (
 
 @dataclass(frozen=True)
 class Stage:
-    """One row: what a stage needs and how it is run."""
+    """One row: the needs of a stage and how it is run."""
 
     name: str  # its folder in the workspace and its section in recon.toml
     verb: str  # that the user types

@@ -65,7 +65,7 @@ _STRETCHES = 5  # of frames that are left out, in the tables
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What is scored and on which views."""
+    """The models to score and the views."""
 
     out: Path
     folders: Mapping[str, Path]  # of train and prune, by model

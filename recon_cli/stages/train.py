@@ -35,7 +35,7 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
 def _count_blocks(
     config: TrainConfig, scene: Scene, model: FinishedModel | None, ctx: StageContext
 ) -> int:
-    """Returns how many blocks a scene is trained in; 1 for one model, and tells what that means."""
+    """Returns the number of blocks of a scene, 1 for one model; tells the user about blocks."""
     views = len(scene.train) + len(scene.validation) + len(scene.test)
     if model is None:
         count = blocks.count_blocks(views, config.blocks)

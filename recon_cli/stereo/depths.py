@@ -67,8 +67,8 @@ class _Sweep:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
-    """A view that is searched, and between which depths."""
+class StereoView:
+    """A view and the range of depths to search."""
 
     view: TrainView
     nearest: float  # world units
@@ -83,7 +83,7 @@ class Photo:
 
 
 def find_depths(
-    photos: Sequence[Photo], partners: NDArray[np.int64], near: float,
+    photos: Sequence[StereoView], partners: NDArray[np.int64], near: float,
     on_photo: Callable[[], None] = lambda: None, *, levels: Levels | None = None,
 ) -> list[NDArray[np.float32]]:
     """Returns a depth map [H, W] in world units of each photo, 0 where there is none.
@@ -166,7 +166,7 @@ def compile_kernels() -> None:
     cameras = [Camera(_SMALL, _SMALL, _SMALL, _SMALL, _SMALL / 2, _SMALL / 2, viewmat)
                for viewmat in (np.eye(4), np.eye(4))]
     image = np.zeros((_SMALL, _SMALL, 3), np.uint8)
-    find_depths([Photo(TrainView(camera, image), 1.0, 2.0) for camera in cameras],
+    find_depths([StereoView(TrainView(camera, image), 1.0, 2.0) for camera in cameras],
                 np.array([[1], [0]]), near=0.1)
 
 

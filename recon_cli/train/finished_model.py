@@ -93,7 +93,7 @@ class FinishedModel:
                 for name, value in given.items()}
 
     def write_inherited_files(self, schedule: Schedule, out: Path, ctx: StageContext) -> None:
-        """Writes what the result takes over into its folder, and tells the user of the start."""
+        """Writes the inherited files into the result's folder, and tells the user of the start."""
         if self.trained:
             logger.info("training continues from step %s of the finished run", f"{self.steps:,}")
             if schedule.steps < _FEW * self.steps:

@@ -47,7 +47,7 @@ SEAM_DROP_DB = 1.0  # of a view against the block that trained it; a visible sea
 
 @dataclass(frozen=True, eq=False)
 class TrainedBlock:
-    """A block's model, and what it owns."""
+    """A block's model, and the part of space that it owns."""
 
     name: str
     splats: Splats
@@ -135,7 +135,7 @@ def _summarize(
 def _run_config(
     blocks: Sequence[TrainedBlock], steps: int, count: int, degree: int
 ) -> RunConfig:
-    """Returns the options of the fine-tuning: what the blocks were trained with."""
+    """Returns the options of the fine-tuning: those of the blocks."""
     configs = [block.config for block in blocks]
     denoised = all(each.images == "denoised" for each in configs)
     drifting = steps > 0 and any(each.exposure == "on" for each in configs)
@@ -190,7 +190,7 @@ def _own(block: TrainedBlock) -> Splats:
 def _seam_changes(
     splats: Splats, blocks: Sequence[TrainedBlock], max_size: int, scene: Scene, ctx: StageContext
 ) -> dict[str, float]:
-    """Returns what validation views of several blocks gain over the best of these, in dB by name.
+    """Returns the gain of validation views of several blocks over the best of these, dB by name.
 
     A block's own model has no seam where its view looks into another cell.
     """

@@ -115,7 +115,7 @@ def new_state(
 
 
 def save_state(path: Path, state: TrainState) -> None:
-    """Writes a checkpoint, whole or not at all.
+    """Writes a checkpoint atomically.
 
     Raises:
         TrainingError: a parameter is not finite; the checkpoint before it stays.

@@ -71,7 +71,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
 
 
 def _sparse_model(scene: Scene, names: Sequence[str]) -> SparseModel:
-    """Returns what is known of the views of these names."""
+    """Returns the records of the views of these names."""
     seen = {} if scene.sparse is None else read_visibility(scene.sparse)
     nothing = np.empty(0, np.int64)
     return SparseModel(scene.points, [seen.get(name, nothing) for name in names])
@@ -183,7 +183,7 @@ def gaussians_within(one: MemoryEstimate, free: int) -> int:
 def refuse_what_does_not_fit(
     needed: MemoryEstimate, free: int, *, limited: bool = False
 ) -> None:
-    """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes.
+    """Raises TrainingError, naming an option to lower, unless the estimate fits into `free` bytes.
 
     `limited` says that more are free, but not to be used.
     """

@@ -1,4 +1,4 @@
-"""The trust of a model: what its Gaussians rest on, the calibrated errors, and both on disk."""
+"""The trust of a model: the support of its Gaussians, the calibrated errors, and both on disk."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Agreement(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class ModelTrust(JsonRecord):
-    """What trust.json says about one model."""
+    """The record of one model in trust.json."""
 
     views: int  # training views that were looked at
     error: ErrorModel
@@ -85,7 +85,7 @@ class TrustRecord(JsonRecord):
         write_json(evaluate / FOLDER / RECORD, self.to_json())
 
     def model_trust(self, model: str) -> ModelTrust | None:
-        """Returns what is said about base or pruned."""
+        """Returns the record of base or pruned."""
         return {"base": self.base, "pruned": self.pruned}[model]
 
     @property
@@ -116,7 +116,7 @@ class Trust:
         return self.error.expect(picture.terms)
 
     def to_json(self) -> dict[str, Any]:
-        """Returns what a 16-bit picture of it means, for readers and as its fingerprint."""
+        """Returns the meaning of a 16-bit picture of it, for readers and as its fingerprint."""
         return {"unit": "expected mean absolute error of the channels, full range = 1",
                 "error_per_step": 1 / FULL, "views": len(self.support.rows),
                 "model": self.error.to_json()}
@@ -205,7 +205,7 @@ def model_trust(
     gains: bool, backend: str,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _error: None,
 ) -> ModelTrust:
-    """Returns what is known about a model's trust, checked on views that did not calibrate it.
+    """Returns the record of a model's trust, checked on views that did not calibrate it.
 
     `on_view` gets each of the `views` and its expected error [H, W].
     """

@@ -1,4 +1,4 @@
-"""What each Gaussian rests on: the training views that show it, from where, and how well.
+"""The support of each Gaussian: the training views that show it, from where, and how well.
 
 One forward pass over the training views; held-out and validation views take no part.
 """
@@ -42,7 +42,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """What the training views show of N Gaussians."""
+    """The support of N Gaussians in the training views."""
 
     rows: tuple[Tensor, ...]  # by view the Gaussians that it shows, [K] int64
     centers: NDArray[np.float64]  # [V, 3] of these views, world units
@@ -94,7 +94,7 @@ class Support:
                      torch.where(torch.isinf(nearest), torch.zeros_like(nearer), nearer))
 
     def save(self, path: Path) -> None:
-        """Writes the support as safetensors, whole or not at all."""
+        """Writes the support as safetensors, atomically."""
         shown = np.zeros((len(self.rows), len(self.residual)), bool)
         for row, rows in zip(shown, self.rows, strict=True):
             row[rows.cpu().numpy()] = True
@@ -137,7 +137,7 @@ def measure_support(
     gains: bool = False, on_view: Callable[[], None] = lambda: None,
     digest: str = "",
 ) -> Support:
-    """Returns what training views show of the Gaussians, by one forward pass over them.
+    """Returns the support of the Gaussians in the training views, by one forward pass over them.
 
     `gains` compares after the best gain per channel, as where exposures were trained.
     """

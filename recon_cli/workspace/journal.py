@@ -55,7 +55,7 @@ def journal_path(folder: Path) -> Path:
 
 
 def start(folder: Path) -> None:
-    """Begins to keep digests of what is written below a folder of unfinished work."""
+    """Begins to keep digests of the files below a folder of unfinished work."""
     journal_path(folder).write_bytes(b"")
 
 
@@ -82,7 +82,7 @@ def expect_removal(path: Path) -> None:
 
 
 def expect_growth(path: Path) -> None:
-    """Records what `path` holds now; what is appended to it later does not count."""
+    """Records the content of `path` now; lines appended to it later do not count."""
     place = _find(path)
     if place:
         with path.open("rb") as file:
@@ -137,7 +137,7 @@ def crc32(path: Path, size: int | None = None) -> int:
 
 
 def _restore(path: Path, state: _State) -> bool:
-    """Returns whether a file is in a state; what was appended since is cut off."""
+    """Returns whether a file is in a state; bytes appended since are cut off."""
     if state.size is None or path.is_symlink() or not path.is_file():
         return False
     size = path.stat().st_size

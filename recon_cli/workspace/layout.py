@@ -162,7 +162,7 @@ class Workspace:
         remove(journal.journal_path(self.partial(stage)))
 
     def seal(self, stage: str, *, without: Collection[str] = ()) -> dict[str, FileDigest]:
-        """Flushes what a stage wrote and returns the digest of every file, by relative path.
+        """Flushes a stage's files and returns the digest of each, by relative path.
 
         Files `without` are in its folder, but not of its making.
         """
@@ -213,7 +213,7 @@ class Workspace:
         sync_folder(old.parent)
 
     def recover(self) -> None:
-        """Completes or undoes what a crash interrupted, stage by stage."""
+        """Completes or undoes work interrupted by a crash, stage by stage."""
         for name in (journal.PARTIAL, _OLD):
             path = self.root / name
             if (path.is_symlink() and name == _OLD) or (
@@ -239,12 +239,12 @@ class Workspace:
                 remove(old)
 
     def remove(self, stage: str) -> None:
-        """Removes a stage's result as a whole; raises WorkspaceError where the folder is none."""
+        """Removes a stage's result; raises WorkspaceError where the folder is none."""
         self._retire(stage)
         remove(self._old(stage))
 
     def scraps(self) -> list[Path]:
-        """Returns what no finished result needs: unfinished work, old results, blocks, seeds.
+        """Returns files that no finished result needs: unfinished work, old results, blocks, seeds.
 
         Where one of these folders is a link, that is the link, not what it leads to.
         """
@@ -347,7 +347,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Renames a folder to where nothing is, also to another file system: whole or not at all."""
+    """Renames a folder to where nothing is, also to another file system, atomically."""
     try:
         source.rename(target)
     except OSError as error:
@@ -391,7 +391,7 @@ def hold_lock(root: Path, verb: str, *, other: str = "another workspace with -w"
 
 
 def _name_holder(path: Path, verb: str) -> None:
-    """Writes who holds the lock. The lock is what counts, so a full disk does not matter here.
+    """Writes who holds the lock. Only the lock counts, so a full disk does not matter here.
 
     Nor does half a file of a process that was killed: the next one writes another.
     """

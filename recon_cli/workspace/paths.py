@@ -43,6 +43,6 @@ def refuse_special(path: Path) -> None:
 
 
 def describe_special(path: Path) -> str:
-    """Returns what a path is in words, empty for a file or a folder; OSError if it is not there."""
+    """Returns the kind of a path in words, empty for a file or folder; OSError if it is missing."""
     mode = os.stat(path).st_mode
     return next((kind for is_kind, kind in _KINDS.items() if is_kind(mode)), "")

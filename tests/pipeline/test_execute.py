@@ -1,4 +1,4 @@
-"""What later stages need is imported while a stage leaves a core idle."""
+"""The modules of later stages are imported while a stage leaves a core idle."""
 
 import dataclasses
 import sys

@@ -32,7 +32,7 @@ HASWELL = {
 
 @dataclass(frozen=True)
 class Run:
-    """What a process left.
+    """The results of a process.
 
     Attributes:
         report: of numba_process.

@@ -13,7 +13,7 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo import kernels
 from recon_cli.stereo.depths import (
     Levels,
-    Photo,
+    StereoView,
     camera_row,
     find_depths,
     find_partners,
@@ -34,7 +34,7 @@ def partners_of(cameras, most=20):
 def depths_of(views, guess=3.0, gains=None):
     """Depth of the views where surfaces are said to be `guess` away."""
     gains = [1.0] * len(views) if gains is None else gains
-    photos = [Photo(view, guess, guess, gain) for view, gain in zip(views, gains, strict=True)]
+    photos = [StereoView(view, guess, guess, gain) for view, gain in zip(views, gains, strict=True)]
     return find_depths(photos, partners_of([view.camera for view in views]), NEAR)
 
 
@@ -147,7 +147,7 @@ def ceiling_views(noise=1.0):
 
 
 def ceiling_depths(views, truths, levels=None, on_photo=lambda: None):
-    photos = [Photo(view, truth.min(), truth.max())
+    photos = [StereoView(view, truth.min(), truth.max())
               for view, truth in zip(views, truths, strict=True)]
     x, y = np.meshgrid(np.linspace(0, 5, 40), np.linspace(-2, 2, 30))
     points = np.stack([x, y, np.full_like(x, CEILING)], axis=-1).reshape(-1, 3)

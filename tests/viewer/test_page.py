@@ -31,7 +31,7 @@ def sessions(monkeypatch):
 
 
 def picture(elsewhere, page, client, camera):
-    """What the browser draws for a camera, [H, W, 3] over black."""
+    """The browser's picture for a camera, [H, W, 3] over black."""
     turn = camera.viewmat[:3, :3].T
     asked = elsewhere.submit(
         client.get_render, camera.height, camera.width, transport_format="png", timeout=60,

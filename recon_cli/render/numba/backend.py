@@ -191,7 +191,7 @@ def _can_run_all() -> bool:
 
 
 def _compile(folder: Path) -> None:
-    """Compiles what a folder lacks; all kernels, where what it holds cannot be read."""
+    """Compiles the kernels that a folder lacks; all of them where its files cannot be read."""
     has_files = bool(_finished(folder))  # a crash can lose _READY and cut files short
     try:
         _run_all()
@@ -219,7 +219,7 @@ def _without_scipy() -> Iterator[None]:
 
 
 def _clear(folder: Path) -> None:
-    """Deletes what a folder holds; another process may do so at the same time."""
+    """Deletes the files of a folder; another process may do so at the same time."""
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)

@@ -18,9 +18,9 @@ from recon_cli.render.torch.blocks import (
     CHANNELS,
     DEPTH,
     PIXELS,
-    Block,
     InstanceLists,
     Scratch,
+    TileBlock,
     alphas,
     build_table,
     composite,
@@ -87,7 +87,7 @@ def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What compositing reads beside the tensors that have gradients."""
+    """The inputs of compositing beside the tensors that have gradients."""
 
     projection: Projection
     instances: Instances
@@ -117,7 +117,7 @@ class _Rasterize(torch.autograd.Function):
         tally = _Tally(instances, means2d, counting) if view.scores else None
         lists = InstanceLists.from_instances(instances)
 
-        def composite_group(tiles: Tensor) -> list[Block]:
+        def composite_group(tiles: Tensor) -> list[TileBlock]:
             blocks = []
             for block in lists.walk(tiles, transmittance):
                 affine = whitening_of(table, block, instances.tiles_x)
@@ -164,7 +164,7 @@ class _Rasterize(torch.autograd.Function):
         scored = means2d.new_zeros(len(instances.gaussians) + 1, 3) if view.scores else None
         upper = means2d.new_ones(DEPTH, DEPTH).triu(1)
 
-        def descend_group(blocks: list[Block]) -> None:
+        def descend_group(blocks: list[TileBlock]) -> None:
             for block in reversed(blocks):
                 n, k = block.rows.shape
                 affine = whitening_of(table, block, instances.tiles_x)
@@ -206,7 +206,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _leave_one_out(
-    used: Tensor, odds: Tensor, live: Tensor, composited: Tensor, block: Block, upper: Tensor,
+    used: Tensor, odds: Tensor, live: Tensor, composited: Tensor, block: TileBlock, upper: Tensor,
     counting: Tensor | None,
 ) -> Tensor:
     """Returns the block's part [n, K] of loo and moves `composited` in front of the block.
@@ -249,7 +249,7 @@ class _Tally:
         self._hits, self._sum, self._max = (
             like.new_zeros(len(instances.gaussians) + 1) for _ in range(3))
 
-    def add(self, block: Block, weights: Tensor) -> None:
+    def add(self, block: TileBlock, weights: Tensor) -> None:
         """Takes the blend weights [n, K, 256] of a block."""
         if self._counting is not None:
             weights = weights * self._counting[block.tiles, None]

@@ -23,7 +23,7 @@ class Recorder(Protocol):
     """Turns work into work that does the same to the same memory."""
 
     def reset(self) -> None:
-        """Frees the memory of all recordings, which are no longer referenced."""
+        """Frees the memory of all recordings, once nothing refers to them."""
 
     def __call__(self, work: Work) -> Work:
         """Returns a function that replays the work; RuntimeError if it cannot be recorded."""

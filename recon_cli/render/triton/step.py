@@ -176,7 +176,7 @@ class PhotometricStep:
         self, source: ViewInput, gradients: Splats, camera: Camera, target: _DeviceTarget,
         options: StepOptions,
     ) -> Callable[[], None]:
-        """Returns the work on a view of this size, which reads what differs from view to view."""
+        """Returns the work on views of this size; it reads the values that differ among them."""
         room, statistics = self._room, self.statistics
         backward = BackwardOptions(
             plain=True, details=options.details, loo=options.loo, harmonics=options.harmonics)

@@ -1,4 +1,4 @@
-"""What the device records while the host does not wait: which steps counted, and why not."""
+"""The device's record while the host does not wait: which steps counted, and why not."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class StepStatus:
         return self.numbers[LOSS.value]
 
     def close(self) -> StepReport:
-        """Waits for the device, returns what it recorded, and resets it."""
+        """Waits for the device, returns its record, and resets it."""
         _, stopped, needed, skipped, instances, loss = self.numbers.tolist()
         self.numbers.copy_(self._first)
         return StepReport(
