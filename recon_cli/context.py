@@ -83,7 +83,7 @@ class StageInputs:
     folders: Mapping[str, Path] = field(default_factory=dict)
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
     continues: Path | None = None  # finished result of the stage itself that the run continues
-    digests: Mapping[str, str] = field(default_factory=dict)  # of what each of `folders` holds
+    digests: Mapping[str, str] = field(default_factory=dict)  # of the files in each of `folders`
     earlier: EarlierResult | None = None  # that the stage adds to or continues, if any
     again: bool = False  # files that are up to date are written again as well
 
@@ -101,7 +101,7 @@ class StageContext:
     # called where the stage keeps to one core, of another process, from now on
     while_idle: Callable[[], None] = _leave_idle
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
-    max_memory_bytes: int | None = None  # that a stage may take; None: what is free
+    max_memory_bytes: int | None = None  # that a stage may take; None: all that is free
     scratch: Path | None = None  # folder for files without a name; None: the system's
     compute: ComputeConfig | None = None  # as typed, for work on other machines; None: as here
 

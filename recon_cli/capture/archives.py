@@ -14,7 +14,7 @@ from recon_cli.capture.foreign import recognise_file
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.errors import InputError
 
-# First bytes, where they are, and what unpacks such a file into a folder.
+# First bytes, their offset, and the command that unpacks such a file into a folder.
 _UNPACK = "mkdir -p {folder} && {command} && recon ingest {folder}"
 _SIGNATURES: tuple[tuple[bytes, int, str], ...] = (
     (b"PK\x03\x04", 0, "unzip {file} -d {folder}"),

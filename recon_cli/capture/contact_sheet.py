@@ -180,7 +180,7 @@ def _choose_sample(candidates: Sequence[FrameCandidate], most: int) -> list[Fram
     dropped = sum(map(len, by_reason.values()))
     room = {Reason.KEPT: min(len(chosen), max(int(KEPT_SHARE * most), most - dropped))}
     left = most - room[Reason.KEPT]
-    # The rarest reason first: what it does not need goes to the others.
+    # The rarest reason first: its unused share goes to the others.
     for place, reason in enumerate(sorted(by_reason, key=lambda name: len(by_reason[name]))):
         room[reason] = min(len(by_reason[reason]), left // (len(by_reason) - place))
         left -= room[reason]

@@ -25,7 +25,7 @@ _NERFSTUDIO = "ns-process-data {kind} --data {folder} {more}--output-dir SCENE"
 class ForeignLayout:
     """The files of one program or app."""
 
-    words: str  # what it is, in a sentence
+    words: str  # a description in a sentence
     carries: str  # what would be lost: "poses", "poses and depth"
     patterns: tuple[str, ...]  # of its files below the folder, the first that exists counts
     marks: tuple[bytes, ...] = ()  # all of them are in such a file; none: its name is enough
@@ -137,7 +137,7 @@ class Found:
 
     row: ForeignLayout
     folder: Path  # that was looked in
-    path: Path  # what it was recognised by
+    path: Path  # the file that identified it
 
     @property
     def place(self) -> str:

@@ -1,7 +1,7 @@
 """Frames of photos: all that can be read and show a view of their own.
 
 Photos that follow each other are chosen like the frames of a video, by `photo_sequence`, and get
-tracks; those that show nothing of what the others show are set aside.
+tracks; those that share nothing with the others are set aside.
 """
 
 from __future__ import annotations
@@ -299,7 +299,7 @@ def _find_masks(
         ctx.notice(f"Masks without a photo are left out: {names}.")
     if masks.unused and not masks.by_photo:
         ctx.notice(
-            f"No mask is used: that of {photos[0].name} must be called "
+            f"No mask is used: the mask of {photos[0].name} must be called "
             f"{photos[0].path.stem}.png or {photos[0].name}.png.")
     return masks
 

@@ -59,8 +59,8 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     if scan.overlay is not None:
         picture = scan_file.name.replace(SCAN, PICTURE)
         ctx.notice(
-            f"{float(scan.overlay.mean()):.1%} of the picture of {path.name} is fixed to the "
-            "camera (text, a logo, dirt on the lens) and is masked in all of its frames; "
+            f"An overlay (text, a logo, dirt on the lens) stays in place in {path.name}: "
+            f"{float(scan.overlay.mean()):.1%} of the picture is masked in all frames; "
             f"{picture} in the folder of ingest shows where. --overlays keep leaves it in.")
     for notice in scan.notices:
         ctx.notice(notice)

@@ -254,7 +254,7 @@ def find_white(paths: Iterable[Path]) -> int:
     """Returns the brightest value that pictures of 16 bits can hold: 65535, or less.
 
     Cameras of 8 to 14 bits store their values in 16 without scaling them: then no picture of a set
-    has a value above 4095, say. What cannot be read is left to whoever needs it.
+    has a value above 4095, say. Unreadable files are left to their reader.
     """
     brightest = 0
     for path in paths:

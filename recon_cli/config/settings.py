@@ -46,7 +46,7 @@ GONE: dict[str, dict[str, tuple[Any, ...]]] = {
 }
 
 FILE = "recon.toml"  # in the workspace
-Settings = dict[str, dict[str, Any]]  # section -> field -> value, only what was set
+Settings = dict[str, dict[str, Any]]  # section -> field -> value, explicit ones only
 C = TypeVar("C", bound=StageConfig)
 AUTOMATIC = "automatic"  # how None is written in --set
 _TRUTH = {"true": True, "false": False}

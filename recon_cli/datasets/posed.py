@@ -125,7 +125,7 @@ class PosedSet:
     splits: bool = False  # it says itself which images are held out
     points: NDArray[np.float64] | None = None  # [P, 3] sparse points in its world, if it has any
     colors: NDArray[np.uint8] | None = None  # [P, 3] RGB of the points
-    notices: tuple[str, ...] = ()  # what the user should know about how it was read
+    notices: tuple[str, ...] = ()  # for the user, about how it was read
 
     @property
     def lenses(self) -> tuple[Lens, ...]:

@@ -37,7 +37,7 @@ class Command:
 
     words: tuple[str, ...]  # after `recon`
     workspace: Path
-    log: Path  # gets what it prints; replaced by each call
+    log: Path  # for its output; replaced by each call
 
 
 class Executor(Protocol):

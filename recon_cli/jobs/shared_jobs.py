@@ -26,7 +26,7 @@ class SharedJob:
 
     name: str  # of its bar
     command: Command
-    look: Callable[[], tuple[float, str]]  # the share that is done, 0 to 1, and what it is at
+    look: Callable[[], tuple[float, str]]  # the share that is done, 0 to 1, and its activity
     weight: float = 1.0  # among all jobs
     # called right before it starts; a reason that it returns keeps the job from running
     prepare: Callable[[], str] = lambda: ""
@@ -54,7 +54,7 @@ def run_jobs(
     Raises:
         BackendError: the machines cannot be reached any more.
     """
-    shares, lock = [_look(job)[0] for job in jobs], threading.Lock()  # what was done before
+    shares, lock = [_look(job)[0] for job in jobs], threading.Lock()  # done before
     total = sum(job.weight for job in jobs)
 
     def look(index: int) -> tuple[int, str]:

@@ -139,7 +139,7 @@ class WorkspaceCheck:
         try:
             return layers.build(row.config, layers.merge(
                 [{layers.section_of(row.config): stored}, self._settings]))
-        except ConfigError:  # stored values that exclude each other or what is set now
+        except ConfigError:  # stored values that exclude each other or the present ones
             return layers.build(row.config, self._settings)
 
     def upstream(self, row: Stage) -> dict[str, str | None]:
@@ -185,7 +185,7 @@ class WorkspaceCheck:
     ) -> ResultKey:
         """Returns the key that the result of a run would have now."""
         upstream = self.upstream(row)
-        for need in row.needs:  # what is missing now may well come out as it was
+        for need in row.needs:  # a missing result may well come out as it was
             upstream[need] = upstream[need] or stored.upstream.get(need)
         return ResultKey(
             row.name, row.version, config.hashed_fields(), sources, upstream, stored.continues,

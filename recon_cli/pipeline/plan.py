@@ -56,12 +56,12 @@ class StageStatus:
 
     name: str  # of the stage and of its folder
     state: str  # fresh, stale, partial, missing or damaged
-    reasons: tuple[str, ...]  # why it is stale or what is damaged, in words
+    reasons: tuple[str, ...]  # why it is stale or damaged, in words
     done: int  # how much of an interrupted run would be resumed; 0 where there is none
     total: int  # of how much; 0 without an interrupted run
     seconds: float | None  # that the finished result took; None where there is none
     summary: dict[str, Any]  # of the finished result
-    notices: tuple[str, ...]  # what the user should know but makes nothing stale
+    notices: tuple[str, ...]  # for the user; they make nothing stale
 
 
 def status(job: Job) -> tuple[StageStatus, ...]:
@@ -223,7 +223,7 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         yield from _run_if_needed(job, step)
     if steps:
         checks = job.inspect()
-        plan(checks, row.name)  # what was fresh may have become stale by what has just run
+        plan(checks, row.name)  # a fresh stage may have become stale by the last one
         fresh = None if again else _find_fresh(job, checks, target, sources)
     if fresh is None:
         start = Start.ANEW if again and target.start is Start.AUTO else target.start
@@ -298,7 +298,7 @@ def _log_to(path: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        # To the file alone: what the user sees of it is up to the caller.
+        # To the file alone: the caller decides on the terminal.
         handler.handle(logger.makeRecord(
             logger.name, logging.ERROR, __file__, 0, "failed", (), sys.exc_info()))
         raise
@@ -313,7 +313,7 @@ class Freed:
 
     path: Path
     size: int
-    is_link: bool  # which alone is removed, not what it points to
+    is_link: bool  # which alone is removed, not its target
 
 
 def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:

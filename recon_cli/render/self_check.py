@@ -55,8 +55,8 @@ class Verdict:
 
     backend: str
     device: str  # name of the GPU, or "cpu"
-    failure: str  # what differed and by how much, or what was raised; empty where all is well
-    errors: dict[str, float]  # every comparison, as a multiple of what is allowed
+    failure: str  # the difference, or the exception; empty where all is well
+    errors: dict[str, float]  # every comparison, as a multiple of the allowed difference
     seconds: float  # that the check took
 
     @property

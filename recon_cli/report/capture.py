@@ -55,7 +55,7 @@ class CaptureSection:
 
     sheets: tuple[Markup, ...]  # contact sheets
     more_sheets: int  # contact sheets that are left out
-    overlays: tuple[Markup, ...]  # frames with what is fixed to the camera in red
+    overlays: tuple[Markup, ...]  # frames with overlays in red
     thumbs: tuple[tuple[str, Markup], ...]  # (name, picture) of frames, without a contact sheet
     plan: Markup | None  # None without a mapping to draw
     notes: tuple[str, ...]  # on the plan

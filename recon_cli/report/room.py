@@ -21,7 +21,7 @@ class Room:
     """The section on the room."""
 
     figures: tuple[tuple[str, str], ...]  # (label, value with its interval)
-    notes: tuple[str, ...]  # what was not found
+    notes: tuple[str, ...]  # on measures that are missing
     plan: Markup | None  # data URI, in which nothing needs escaping; None if it cannot be shown
 
 

@@ -115,7 +115,7 @@ class Gravity:
 
     up: NDArray[np.float64] | None  # [3] unit vector, or None
     floor: Floor | None  # the floor at right angles to it, or None
-    cameras: CameraUp | None  # what the axes of the cameras say, or None where there are too few
+    cameras: CameraUp | None  # estimated from the cameras' axes; None where there are too few
     reason: str = ""  # why it is not known, for people; empty where it is
 
 

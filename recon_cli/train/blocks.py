@@ -50,7 +50,7 @@ LEAST_VIEWS = 20  # of a block, so that each view of it has neighbours
 MERGE_SHARE = 0.2  # of the work, about, that is left when all blocks are trained
 STAGE = "train"  # name of a block's result in its folder
 COMMAND = "train-block"  # of recon, which takes JOB
-JOB, OUTPUT = "block.safetensors", "output.txt"  # what to do, and what the command printed
+JOB, OUTPUT = "block.safetensors", "output.txt"  # the command's input and output
 _VERSION = 1
 
 

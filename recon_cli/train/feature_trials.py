@@ -39,7 +39,7 @@ _ERRORS = 1.65  # standard errors, a chance of about one in twenty
 _ERRORS_AGAINST = 1.0  # of a loss; what is on without a trial needs less to go off
 LEAST_VIEWS = 8  # whose mean has a standard error that can be told; fewer, and the split is own
 _SPLIT = 6  # each sixth training view is held out by an own split, or sooner each third or more
-_DENSEST = 3  # of few views; what is left must still hang together
+_DENSEST = 3  # of few views; the rest must still hang together
 
 Arm = Callable[[], Sequence[float]]
 
@@ -277,7 +277,7 @@ class _Bench:
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
                      task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
-        # reduced views would be reduced once more in the search for what lies far outside
+        # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)
         return [mean_psnr(state.splats, [reduce_view(view, LEVEL)], config.sh_degree, task.backend,

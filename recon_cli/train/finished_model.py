@@ -80,8 +80,8 @@ class FinishedModel:
         for name in ("far", "stereo"):
             if getattr(asked, name) == "on":
                 raise ConfigError(
-                    f"{name} is on, but an imported scene has the Gaussians that it has: others "
-                    "are added to the points of sfm only.", hint=f"Leave out --{name}.")
+                    f"{name} is on, but an imported scene keeps its Gaussians: others are "
+                    "only added to the points of sfm.", hint=f"Leave out --{name}.")
         if asked.max_gaussians is not None and asked.max_gaussians < self.gaussians:
             raise ConfigError(
                 f"max_gaussians is {asked.max_gaussians:,}, but the imported scene has "

@@ -87,7 +87,7 @@ def first_state(
     if far is not None:
         points = np.concatenate([points, far.gap_points])
         colors = np.concatenate([colors, far.gap_colors])
-    # what is added does not take the place of sparse points as long as there is room to grow
+    # added Gaussians do not take the place of sparse points as long as there is room to grow
     most = max(most, min(most + len(points) - sparse, config.max_gaussians // 2))
     grey = task.schedule.recipe.backdrop
     centers = np.stack([view.camera.center for view in task.train])

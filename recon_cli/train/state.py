@@ -79,8 +79,8 @@ class TrainState:
     """A run after `iteration` steps."""
 
     optimizer: SplatOptimizer  # holds the splats and their moments
-    gathered: DensificationStats  # what steps left behind for densification
-    generator: torch.Generator  # source of every random choice; on the CPU whatever the device
+    gathered: DensificationStats  # gathered by steps, for densification
+    generator: torch.Generator  # source of every random choice; always on the CPU
     iteration: int = 0  # steps done
     # indices of the views still to come in this epoch, last first
     queue: list[int] = field(default_factory=list)

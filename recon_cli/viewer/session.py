@@ -30,13 +30,13 @@ from recon_cli.viewer.gaussians import PackedSplats, show_backdrop
 from recon_cli.viewer.measure_panel import MeasurePanel
 from recon_cli.viewer.trust_tint import TrustTint
 
-_FRUSTUM_SIZE = 0.03  # of the distance to what is looked at
+_FRUSTUM_SIZE = 0.03  # of the distance to the target of the camera
 _HELD_OUT_COLOR, _FRUSTUM_COLOR = (255, 140, 40), (150, 170, 200)
 NO_VIEW = "none"
 UPS = {"+z": (0, 0, 1), "-y": (0, -1, 0), "+y": (0, 1, 0), "-z": (0, 0, -1), "+x": (1, 0, 0),
        "-x": (-1, 0, 0)}  # recon's own first, then COLMAP's usual one
 _REST_SECONDS = 0.25  # a camera that has not moved for this long has stopped
-_MOVED = 1e-3  # of the distance to what is looked at; smaller moves keep the colours
+_MOVED = 1e-3  # of the distance to the camera's target; smaller moves keep the colours
 _BOX_COLOR = (255, 170, 0)
 
 logger = logging.getLogger("recon")

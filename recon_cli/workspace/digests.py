@@ -1,4 +1,4 @@
-"""SHA-256 digests of files. Size and modification time vouch for a known digest."""
+"""SHA-256 digests of files. A known digest is valid for the same size and modification time."""
 
 from __future__ import annotations
 

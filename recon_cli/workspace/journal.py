@@ -19,7 +19,7 @@ from pathlib import Path
 
 from recon_cli.workspace.paths import is_plain_file
 
-PARTIAL = ".partial"  # the folder, in a workspace, of what is not finished
+PARTIAL = ".partial"  # the folder of unfinished work in a workspace
 SUFFIX = ".digests"
 JOBS = "jobs"  # the folder, in that of a stage, of jobs that it shares out
 _CHUNK = 1 << 20  # bytes
