@@ -100,3 +100,8 @@ def list_names(names: Sequence[str], most: int = 5) -> str:
     """Returns the first names and the number of the others."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def format_count(number: int, noun: str) -> str:
+    """Returns a number with its noun in singular or plural."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"

@@ -7,7 +7,7 @@ from functools import singledispatch
 from typing import Any
 
 from recon_cli.config.stages import MODEL_LABELS
-from recon_cli.errors import ManifestError
+from recon_cli.errors import ManifestError, format_count
 from recon_cli.progress import format_megabytes
 from recon_cli.stages import IMPORT, STAGES
 from recon_cli.workspace.export_record import ExportSummary
@@ -49,7 +49,7 @@ def _(ingest: IngestSummary) -> str:
         f"{ingest.dropped_blurred:,} too blurred, clipped or flat" if ingest.dropped_blurred
         else "",
         f"{ingest.lost_frames:,} damaged or missing" if ingest.lost_frames else "",
-        f"{count(len(ingest.skipped), 'file')} skipped" if ingest.skipped else ""])
+        f"{format_count(len(ingest.skipped), 'file')} skipped" if ingest.skipped else ""])
 
 
 @describe.register
@@ -79,14 +79,15 @@ def _(train: TrainSummary) -> str:
         f"{_validation(train.validation_psnr_db)}",
         f"stopped early, {train.planned_iterations:,} were planned" if early else "",
         f"continued from {train.imported_from}" if train.imported_from else "",
-        f"{count(train.skipped_steps, 'step')} skipped" if train.skipped_steps else ""])
+        f"{format_count(train.skipped_steps, 'step')} skipped" if train.skipped_steps else ""])
 
 
 @describe.register
 def _(imported: ImportSummary) -> str:
-    views = ("" if imported.training_psnr_db is None else
-             f", {imported.training_psnr_db:.2f} dB on {count(imported.views, 'training view')}")
-    return f"{imported.gaussians:,} Gaussians from {imported.imported_from}{views}"
+    views = format_count(imported.views, "training view")
+    score = ("" if imported.training_psnr_db is None else
+             f", {imported.training_psnr_db:.2f} dB on {views}")
+    return f"{imported.gaussians:,} Gaussians from {imported.imported_from}{score}"
 
 
 @describe.register
@@ -105,8 +106,8 @@ def _(scores: EvaluateSummary) -> str:
                       f"(SSIM {scores.pruned_ssim:.3f})")
     missing = len(scores.unregistered_test)
     return _join([
-        f"{', '.join(models)} on {count(scores.test_views, 'held-out view')}",
-        f"{count(missing, 'held-out view')} without a camera" if missing else ""])
+        f"{', '.join(models)} on {format_count(scores.test_views, 'held-out view')}",
+        f"{format_count(missing, 'held-out view')} without a camera" if missing else ""])
 
 
 @describe.register
@@ -123,11 +124,6 @@ def fresh_files(export: ExportSummary) -> list[str]:
     """Returns the names of an export's files that are up to date."""
     others = (export.files or {}).values()
     return [export.file, *(one.file for one in others if not one.stale)]
-
-
-def count(number: int, noun: str) -> str:
-    """Returns a number with its noun in singular or plural."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _validation(psnr_db: float | None) -> str:

@@ -166,7 +166,7 @@ def find_images(
         images.append(replace(item, lens=lens, depth=item.depth and replace(item.depth, lens=lens)))
     notices = []
     if missing:
-        notices.append(f"{len(missing)} of the {len(names)} images that it lists are missing, "
+        notices.append(f"missing: {len(missing)} of the {len(names)} images that it lists, "
                        f"the first is {missing[0]}")
     if factor != 1:
         notices.append(f"its images are {factor:.4g} times as large as its cameras say, so the "

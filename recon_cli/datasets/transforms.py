@@ -28,7 +28,7 @@ from recon_cli.datasets.posed import (
     is_file,
     resolve_inside,
 )
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, format_count
 from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
 from recon_cli.scene.camera import Camera, Lens, make_lens
 from recon_cli.workspace.atomic import read_json, write_json
@@ -260,7 +260,9 @@ def _drop_duplicates(frames: Sequence[_Frame]) -> tuple[list[_Frame], list[str]]
             unique[frame.path] = frame
     notices = []
     if copies:
-        notices.append(f"{len(copies)} images are listed more than once, the first is {copies[0]}")
+        notices.append(
+            f"listed more than once: {format_count(len(copies), 'image')}, the first is "
+            f"{copies[0]}")
     return list(unique.values()), notices
 
 

@@ -58,7 +58,7 @@ class SeedScores:
 
         rows = [(self.kinds[name], *cells(figures)) for name, figures in self.models.items()]
         if self.difference:
-            rows.append(("pruned minus base", *cells(self.difference, "+")))
+            rows.append(("compact minus original", *cells(self.difference, "+")))
         return Table(("model", "PSNR dB", "SSIM", "Gaussians", "train s"), rows)
 
     def record(self) -> dict[str, Any]:
