@@ -59,7 +59,7 @@ def free_memory_bytes() -> int:
 
 
 def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
-    """Returns the CPU's model name from Linux's /proc/cpuinfo, or what Python knows elsewhere."""
+    """Returns the CPU's model name from Linux's /proc/cpuinfo, or from Python elsewhere."""
     if cpuinfo.exists():
         for line in cpuinfo.read_text(encoding="utf-8").splitlines():
             key, _, value = line.partition(":")

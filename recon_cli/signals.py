@@ -1,6 +1,6 @@
 """Signals that end a command: Ctrl-C, SIGTERM (docker stop, timeout, systemd) and SIGHUP.
 
-The first one raises `Interrupted` in the main thread, so that what is unfinished is saved and
+The first one raises `Interrupted` in the main thread, so that unfinished work is saved and
 children end. Programs such as `timeout` send it twice, so another one counts only a while later: it
 ends the process at once, and with it its children, whose standard input ends.
 """
@@ -40,8 +40,8 @@ def exit_code(error: BaseException | None) -> int:
 def describe_end(error: BaseException | None) -> str:
     """Returns the line that says why a command ended, and how to continue."""
     number = exit_code(error) - ExitCode.SIGNAL
-    what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-    return f"{what}; run the same command again to resume"
+    reason = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+    return f"{reason}; run the same command again to resume"
 
 
 class _Watch:

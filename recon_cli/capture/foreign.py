@@ -1,7 +1,7 @@
 """One table of the files of other programs that lie beside pictures and are not read.
 
-A row says what it is, how it is recognised, what it carries and what to type instead. Whoever
-writes a reader for one of them removes its row. Data sets that are read are in `layouts`.
+A row holds a description, how the file is recognised, its content and the command to type instead.
+A new reader for one of them replaces its row. Data sets that are read are in `layouts`.
 """
 
 from __future__ import annotations

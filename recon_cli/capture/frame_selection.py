@@ -3,7 +3,7 @@
 From a video: locally sharp frames, spread evenly over the camera's path, one of those that show the
 same picture. Frames that are mostly black or blown out count as blurred; the best of them bridge
 gaps. Photos are all kept, except those that show nothing or the same view as another: where one of
-two equal views is held out, a model is tested on what it was trained on.
+two equal views is held out, a model is tested on its own training data.
 """
 
 from __future__ import annotations

@@ -114,7 +114,8 @@ def _scan(config: IngestConfig, path: Path, ctx: IngestContext) -> Scan:
 def frame_counts(config: IngestConfig, sources: Sequence[ScannedVideo]) -> list[int]:
     """Returns how many frames to choose from each video, at least `MIN_FRAMES`.
 
-    --frames, or what the motion needs up to --max-frames, is divided by the lengths of the paths.
+    --frames, or the number that the motion needs up to --max-frames, is divided by the lengths
+    of the paths.
     """
     wanted = [frame_selection.automatic_count(source.lengths, most=config.max_frames)
               for source in sources]

@@ -1,8 +1,9 @@
 """Photos that follow each other, such as the frames of a video that somebody has dumped.
 
 Names say in which order they may have been taken, and the pictures whether they were: where nearly
-all neighbours show the same corners, the photos are a walk, whatever its steps. It is scanned and
-thinned by the means of videos. Photos that were taken one by one, on purpose, are left as they are.
+all neighbours show the same corners, the photos are a walk with steps of any size. It is scanned
+and thinned by the means of videos. Photos that were taken one by one, on purpose, are left as they
+are.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class PhotoSequence:
 
     @classmethod
     def read(cls, record: Path, photos: Sequence[Photo]) -> PhotoSequence | None:
-        """Returns what `write` wrote; None where it is missing, damaged or of other photos."""
+        """Reads the file of `write`; None where it is missing, damaged or of other photos."""
         if not record.exists():
             return None
         try:

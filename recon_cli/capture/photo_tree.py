@@ -1,7 +1,7 @@
 """Which pictures below a folder are the photos of a capture, and the other files there.
 
 All pictures below the folder are photos, but for masks, depth and the like, reduced copies, and
-what `io.foreign` says is none. What is left out is named, with what to type.
+the pictures that `capture.foreign` lists. Those left out are named, with the command to type.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _describe_aside(
 ) -> Iterator[str]:
     """Yields which folders with pictures are left out, and how to use them.
 
-    `told` is what the programs that are named anyway have written.
+    `told` are the files of programs that are named anyway.
     """
     for place, (kind, count) in sorted(walk.aside.items()):
         if kind in ("depth maps", "confidence maps") and any("depth" in text for text in told):

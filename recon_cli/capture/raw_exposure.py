@@ -2,7 +2,7 @@
 
 EXIF gives the exposure precisely enough, but converters lose it or copy it wrongly. The brightness
 of shared points in overlapping photos gives it too, with noise that adds up along a chain of
-photos. So EXIF is used unless the pixels clearly contradict it, and pixels replace what is missing.
+photos. So EXIF is used unless the pixels clearly contradict it, and pixels replace missing values.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Command-line options: those that every verb has, and those made from the config dataclasses.
 
 An option stores its value in a `Call` and is passed to no function. A config field therefore is
-declared once, in config/stages.py, and only what was typed reaches the settings.
+declared once, in config/stages.py, and only typed options reach the settings.
 """
 
 from __future__ import annotations
@@ -206,8 +206,8 @@ def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
     return stack([config_options(config), where, again, print_config, common()])
 
 
-def executor(what: str) -> Decorator:
-    """Returns a decorator that adds where commands run, and how many (of `what`) at once."""
+def executor(jobs: str) -> Decorator:
+    """Returns a decorator that adds where commands run, and how many `jobs` (a plural) at once."""
     return stack([
         click.option(
             "--on", "place", type=click.Choice(["local", "ray"]), default="local",
@@ -215,7 +215,7 @@ def executor(what: str) -> Decorator:
                  "[default: local]"),
         click.option(
             "--jobs", type=click.IntRange(min=1), metavar="N",
-            help=f"{what} at once.  [default: one for each {CORES} cores]")])
+            help=f"{jobs} at once.  [default: one for each {CORES} cores]")])
 
 
 def compute(*, trains: bool = False, without: Sequence[str] = ()) -> Decorator:

@@ -203,7 +203,7 @@ def export(call: Call) -> None:
 def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
     """Run every stage from INPUT to the exported .ply.
 
-    INPUT is what `recon ingest` takes. Without it, the previous input is used.
+    INPUT is as for `recon ingest`. Without it, the previous input is used.
     """
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
     run_stages(call, "run", stages, sources=inputs, base=MID)

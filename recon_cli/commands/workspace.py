@@ -109,8 +109,8 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
 def report(call: Call, out: Path | None) -> None:
     """Write an HTML report: capture, scores, views, settings.
 
-    It is one file that any browser opens without a network. No stage is run; the report names what
-    is missing or stale, with the command to type.
+    It is one file that any browser opens without a network. No stage is run; the report names
+    missing or stale results, with the command to type.
     """
     from recon_cli.report.build import write_report
 

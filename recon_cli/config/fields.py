@@ -47,7 +47,7 @@ def option(default: Any, help: str, **info: Any) -> Any:
 
 
 def option_info(item: dataclasses.Field[Any]) -> OptionInfo:
-    """Returns what `option` declared for a field."""
+    """Returns the declaration of `option` for a field."""
     info: OptionInfo = item.metadata["option"]
     return info
 

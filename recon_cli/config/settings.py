@@ -92,7 +92,7 @@ def _drop_gone(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_assignment(text: str) -> Settings:
-    """Returns what `section.field=value` sets, typed as the field is, or raises ConfigError."""
+    """Returns the setting of `section.field=value`, of the field's type, or raises ConfigError."""
     path, equals, value = text.partition("=")
     section, dot, name = path.strip().partition(".")
     if not equals or not dot:
@@ -169,7 +169,7 @@ def merge(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
 
 
 def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
-    """Returns the config of one class with what `settings` set."""
+    """Returns the config of one class with the values of `settings`."""
     return config(**settings.get(section_of(config), {}))
 
 

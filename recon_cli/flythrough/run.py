@@ -68,7 +68,7 @@ class FrameFolder:
     def prepare(self, settings: Mapping[str, Any], about: Mapping[str, Any]) -> tuple[str, ...]:
         """Prepares the folder for these settings and returns which frames are missing.
 
-        `settings` are JSON values of all that decides what a frame shows, `about` more of them for
+        `settings` are JSON values of all that decides a frame, `about` more of them for
         readers of the record. FormatError if the record of an earlier run is damaged.
         """
         settings = {"schema": _SCHEMA, **settings}

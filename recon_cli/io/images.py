@@ -79,7 +79,7 @@ def decode_file(path: Path, flags: int) -> NDArray[np.uint8] | None:
 def fill_masked(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Returns an image [H, W, 3] whose ignored pixels have the mean colour of those that count.
 
-    SSIM compares windows: what is under the mask must not matter, and black would add an edge.
+    SSIM compares windows: pixels under the mask must not matter, and black would add an edge.
     """
     result = image.copy()
     result[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else 0

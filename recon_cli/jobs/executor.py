@@ -1,8 +1,8 @@
 """Runs recon commands in processes of this machine, or has `ray_executor` do it.
 
-A command is what one would type. What it makes lies in a workspace whose stages commit atomically
-and resume: a retry is the same command, and nothing but an exit code has to come back. How far it
-is can be read in the workspace.
+A command is one that a user could type. Its results lie in a workspace whose stages commit
+atomically and resume: a retry is the same command, and only an exit code has to come back. Its
+progress can be read in the workspace.
 """
 
 from __future__ import annotations

@@ -93,10 +93,10 @@ def run_jobs(
     return [ends[index] for index in range(len(jobs))]
 
 
-def describe_failures(failed: Mapping[str, str], total: int, what: str) -> str:
+def describe_failures(failed: Mapping[str, str], total: int, noun: str) -> str:
     """Returns in a sentence how many of `total` failed and why; `failed` are reasons by name."""
     reasons = list_names([f"{name}: {reason.rstrip('.')}" for name, reason in failed.items()])
-    return f"{len(failed)} of {total} {what} failed ({reasons})."
+    return f"{len(failed)} of {total} {noun} failed ({reasons})."
 
 
 def _look(job: SharedJob) -> tuple[float, str]:

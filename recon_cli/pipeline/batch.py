@@ -105,7 +105,7 @@ def run_batch(
     Raises:
         ConfigError: a workspace holds another capture.
         BackendError: the machines cannot be reached any more.
-        KeyboardInterrupt: after the commands have saved what they have.
+        KeyboardInterrupt: after the commands have saved their work.
     """
     for capture in captures:
         _refuse_other_capture(capture)

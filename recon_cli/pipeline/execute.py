@@ -71,7 +71,7 @@ def run_stage(
     With `again` it does not continue unfinished work.
 
     Raises:
-        ReconError: whatever the stage raises; what it had finished is kept for the next run.
+        ReconError: as the stage raises it; finished work is kept for the next run.
     """
     workspace = job.workspace
     if sources is None:
@@ -252,7 +252,7 @@ def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:
     """Returns where to train and render, once ready.
 
     Raises:
-        BackendError: what was asked for is not available.
+        BackendError: the requested backend or device is not available.
     """
     from recon_cli.render import registry  # imports torch
 

@@ -67,7 +67,7 @@ class StageStatus:
 def status(job: Job) -> tuple[StageStatus, ...]:
     """Returns how every stage stands. Takes no lock and changes nothing.
 
-    A stage whose manifest cannot be trusted is damaged; what needs it is stale.
+    A stage whose manifest cannot be trusted is damaged; stages that need it are stale.
 
     Raises:
         ConfigError: the settings hold a value that cannot be used.
@@ -101,7 +101,7 @@ def run(
         StageError: a need is not fresh and not automatic, or another verb's scene would be
             replaced.
         WorkspaceError: the workspace is in use, full, or not writable.
-        ReconError: whatever the stages raise.
+        ReconError: as the stages raise it.
     """
     outcomes = []
     root, stages = job.workspace.root, [target.stage for target in targets]

@@ -73,7 +73,7 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
 
     On CUDA `auto` takes triton only where its kernels passed the self-check on this GPU. A backend
     that was named runs even where it failed, with a warning: it may be the check that is wrong.
-    BackendError if what was named cannot run; nothing else is used instead.
+    BackendError if the named one cannot run; nothing else is used instead.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendError(
@@ -189,7 +189,7 @@ def render(
         splats: N Gaussians; gradients flow to every raw parameter that requires them.
         camera: a pinhole camera, OpenCV axes, pixel centres at +0.5.
         background: colour behind everything.
-        sh_degree: highest degree in use, 0 to 3; what the splats do not have counts as zero.
+        sh_degree: highest degree in use, 0 to 3; coefficients that the splats lack count as zero.
         backend: a name from `available_backends`.
         scores: also gather hits, blend_sum and blend_max, and loo in the backward pass.
         mask: bool, the pixels that the scores are taken over, None for all; it changes neither the

@@ -111,7 +111,7 @@ class Similarity:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Similarity:
-        """Returns what `to_json` wrote.
+        """Returns the similarity that `to_json` wrote.
 
         Raises:
             ValueError: the values are not a similarity.

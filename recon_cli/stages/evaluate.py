@@ -1,6 +1,6 @@
 """evaluate: scores every model on the held-out views, against the original pixels.
 
-The .ply is read back and rendered, so that the written file is what is measured. Writes
+The .ply is read back and rendered, so that the written file itself is measured. Writes
 metrics.json, metrics.csv, metrics.md, metrics.tex, table.txt, and pictures: renders/<model>/,
 truth/ and difference/<model>/ (absolute error times four). Pixels that a mask ignores are not
 scored: they are painted in one colour in truth/ and black in difference/.

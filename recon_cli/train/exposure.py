@@ -55,7 +55,7 @@ class Exposure:
         return self._rows.tensors(_PREFIX)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Restores what `tensors` returned."""
+        """Restores the state that `tensors` returned."""
         self._rows.restore(_PREFIX, tensors)
 
 

@@ -1,9 +1,9 @@
 """One model of the blocks of a scene, which were trained apart.
 
-Each block keeps the Gaussians in its cell; what it trained around that, so that nothing floats at
-its border, belongs to others. Then all Gaussians are fine-tuned on all views: those at a wall reach
-through to the other side, which no view of their own block sees, and what lies far away was fitted
-by each block for itself.
+Each block keeps the Gaussians in its cell; those trained around it, so that nothing floats at its
+border, belong to others. Then all Gaussians are fine-tuned on all views: those at a wall reach
+through to the other side, which no view of their own block sees, and each block fitted
+distant places for itself.
 """
 
 from __future__ import annotations

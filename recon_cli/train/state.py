@@ -201,12 +201,12 @@ def _unreadable(path: Path, error: Exception) -> FormatError:
         hint=f"Run `recon {path.parent.name} --again`; it starts from the beginning.")
 
 
-def check_finite(tensors: dict[str, Tensor], what: str) -> None:
-    """Raises TrainingError, opening with `what`, unless every value is finite."""
+def check_finite(tensors: dict[str, Tensor], where: str) -> None:
+    """Raises TrainingError, opening with `where`, unless every value is finite."""
     for name, value in tensors.items():
         if value.is_floating_point() and not torch.isfinite(value).all():
             raise TrainingError(
-                f"{what}: {name} holds values that are not finite.",
+                f"{where}: {name} holds values that are not finite.",
                 hint="Run the stage again with --again; if it recurs, lower the learning rates.")
 
 

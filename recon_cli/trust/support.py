@@ -107,7 +107,7 @@ class Support:
 
     @staticmethod
     def load(path: Path) -> Support:
-        """Returns what `save` wrote; FormatError if the file is missing, damaged or of another."""
+        """Reads the file that `save` wrote; FormatError if it is missing, damaged or of another."""
         refuse_special(path)
         try:
             with safe_open(path, framework="pt") as file:

@@ -49,7 +49,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def _share(path: Path) -> None:
     """Gives a file that only its owner may read the permissions of any new file.
 
-    Some libraries (safetensors) write private files whatever the umask says.
+    Some libraries (safetensors) write private files, against the umask.
     """
     if stat.S_IMODE(path.stat().st_mode) & 0o077:
         return

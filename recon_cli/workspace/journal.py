@@ -60,7 +60,7 @@ def start(folder: Path) -> None:
 
 
 def expect(path: Path, temporary: Path) -> None:
-    """Records that `path` is about to hold what `temporary` does, if digests are kept there."""
+    """Records that `path` is about to get the content of `temporary`, if digests are kept there."""
     place = _find(path)
     if place:
         size = temporary.stat().st_size
@@ -94,7 +94,7 @@ def expect_growth(path: Path) -> None:
 def find_damage(folder: Path) -> str:
     """Describes the damage of unfinished work; empty if a run can continue it.
 
-    What has no digest was not finished, and is deleted, as is what was appended to a file since.
+    Files without a digest were not finished and are deleted, as are bytes appended to a file since.
     """
     journal = journal_path(folder)
     try:

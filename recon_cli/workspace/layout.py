@@ -3,10 +3,10 @@
 A stage writes into `.partial/<stage>/`. When it is done, its files are flushed, its manifest is
 written last, and two renames put it in place: the old result to `.old/`, the new one to where the
 old one was. Killed between any two of these steps, the next writer finds either the old or the new
-result and completes what was begun.
+result and completes the swap.
 
-Whatever is deleted here may have been replaced by a link, to a larger disk for example: the link is
-removed, never what it points to.
+A folder to delete may have been replaced by a link, to a larger disk for example: the link is
+removed, never its target.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ class Workspace:
     def scraps(self) -> list[Path]:
         """Returns files that no finished result needs: unfinished work, old results, blocks, seeds.
 
-        Where one of these folders is a link, that is the link, not what it leads to.
+        Where one of these folders is a link, that is the link, not its target.
         """
         parents = [self.root / name for name in (journal.PARTIAL, _OLD, SEEDS, BLOCKS)]
         return [*(path for parent in parents

@@ -142,7 +142,7 @@ class KnownPoses:
 
 
 def read_poses(path: Path) -> KnownPoses:
-    """Returns what `KnownPoses.write` wrote to poses.json; FormatError if a file is damaged."""
+    """Returns the poses that `KnownPoses.write` wrote; FormatError if a file is damaged."""
     value = atomic.read_json(path, dict, hint=AGAIN)
     try:
         viewmats = {
