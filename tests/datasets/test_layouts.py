@@ -84,7 +84,7 @@ def test_photos_and_videos_have_no_layout(tmp_path):
     assert recognise(tmp_path) is None
     assert recognise(tmp_path / "photo.jpg") is None
     assert recognise(tmp_path / "gone") is None
-    with pytest.raises(InputError, match="no data set with poses") as caught:
+    with pytest.raises(InputError, match="not a data set with poses") as caught:
         read_posed(tmp_path)
     assert all(layout.needs in caught.value.hint for layout in LAYOUTS)
 

@@ -89,8 +89,8 @@ def test_intrinsics_that_are_none_are_refused(tmp_path, more, said):
 
 @pytest.mark.parametrize(("matrix", "said"), [
     (np.full((4, 4), np.nan).tolist(), "not finite"),
-    ((2 * posed_sets.pose(2) @ posed_sets.OPENGL).tolist(), "no rigid pose"),
-    ([[1, 0], [0, 1]], "has 4 numbers"), ([], "has 0 numbers"), ("x", "no matrix")])
+    ((2 * posed_sets.pose(2) @ posed_sets.OPENGL).tolist(), "not a rigid pose"),
+    ([[1, 0], [0, 1]], "has 4 numbers"), ([], "has 0 numbers"), ("x", "not a matrix")])
 def test_a_frame_whose_pose_is_none_is_named(tmp_path, matrix, said):
     with pytest.raises(FormatError, match=rf"frame images/0002\.png.*{said}"):
         read(tmp_path, edited(transform_matrix=matrix))

@@ -44,11 +44,11 @@ def test_a_pruned_model_that_is_not_there_is_an_error_and_a_stale_one_is_left_ou
 
 
 @pytest.mark.parametrize(("words", "said"), [
-    (["--views", "000099"], "no view '000099'"),
+    (["--views", "000099"], "views is named '000099'"),
     (["--views", "000001.pgn"], "Did you mean 000001.png?"),
     (["--path", "orbit", "--views", "test"], "exclude each other"),
     (["--output", "rgb,normals"], "'rgb,normals' is not a list"),
-    (["--background", "white"], "no colour such as"),
+    (["--background", "white"], "not a colour such as"),
     (["--size", "100000"], "MB to render"),
     (["--width", "321", "--format", "mp4"], "must be even"),
     (["--format", "mp4", "--width", "40000", "--height", "2"], "libx264 cannot encode"),
