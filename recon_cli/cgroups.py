@@ -99,7 +99,7 @@ def _number(path: Path) -> int | None:
 
 
 def _text(path: Path) -> str:
-    """Returns what a file holds; nothing where there is none, as on other systems."""
+    """Returns the content of a file; empty without the file, as on other systems."""
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:

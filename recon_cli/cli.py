@@ -140,7 +140,7 @@ def _tell(error: BaseException, complete: Callable[[str], str]) -> int:
         if known is None:
             console.print_error(
                 f"{type(error).__name__}: {error}",
-                "This is a bug in recon. Run the command again with -v and report what it prints.")
+                "This is a bug in recon. Run the command again with -v and report its output.")
         else:
             console.print_error(known.message, complete(known.hint))
     return _exit_code(error)
@@ -169,5 +169,5 @@ def _known(error: BaseException) -> ReconError | None:
 
 
 def _signalled(error: BaseException) -> BaseException | None:
-    """Returns what interrupted a command; click passes it on as an Abort."""
+    """Returns the exception that interrupted a command; click passes it on as an Abort."""
     return error.__cause__ if isinstance(error, click.Abort) else error

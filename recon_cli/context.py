@@ -1,4 +1,4 @@
-"""What a stage is given beside its config: where to read, how to report, what to compute on."""
+"""The inputs of a stage beside its config: folders to read, reporting, device and backend."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class TrainReport:
     gaussians: int  # count
     seconds: float  # of this call, so far
     cpu_seconds: float = 0.0  # of all threads of this process in this call, so far
-    # the iteration to which the run jumps now; None where it just goes on
+    # the iteration to which the run jumps now; None where it just continues
     goes_on_at: int | None = None
 
 
 class TrainCallback:
-    """Is called between the steps of a training; may read what it is given and change nothing.
+    """Is called between the steps of a training; may read its arguments and change nothing.
 
     By default it does nothing. What takes long belongs elsewhere, and an exception ends the fit.
     """
@@ -66,7 +66,7 @@ def _leave_idle() -> None:
 
 @dataclass(frozen=True)
 class EarlierResult:
-    """The finished result that a stage replaces, where it keeps files of it or goes on from it."""
+    """The finished result that a stage replaces, where it keeps files of it or continues it."""
 
     folder: Path
     summary: Mapping[str, Any]  # that the stage returned then; empty where that is not known
@@ -77,14 +77,14 @@ class EarlierResult:
 
 @dataclass(frozen=True)
 class StageInputs:
-    """What a stage may read."""
+    """The folders and files that a stage may read."""
 
     # finished folder by stage name: of all in `needs`, and of those in `uses` that are fresh
     folders: Mapping[str, Path] = field(default_factory=dict)
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
-    continues: Path | None = None  # finished result of the stage itself that the run goes on from
-    digests: Mapping[str, str] = field(default_factory=dict)  # of what each of `folders` holds
-    earlier: EarlierResult | None = None  # that the stage adds to or goes on from, if any
+    continues: Path | None = None  # finished result of the stage itself that the run continues
+    digests: Mapping[str, str] = field(default_factory=dict)  # of the files in each of `folders`
+    earlier: EarlierResult | None = None  # that the stage adds to or continues, if any
     again: bool = False  # files that are up to date are written again as well
 
 
@@ -99,9 +99,9 @@ class StageContext:
     # called with (done, total) whenever that would survive a crash; shown by `recon status`
     record: Callable[[int, int], None] = _ignore
     # called where the stage keeps to one core, of another process, from now on
-    on_idle: Callable[[], None] = _leave_idle
+    while_idle: Callable[[], None] = _leave_idle
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
-    max_memory_bytes: int | None = None  # that a stage may take; None: what is free
+    max_memory_bytes: int | None = None  # that a stage may take; None: all that is free
     scratch: Path | None = None  # folder for files without a name; None: the system's
     compute: ComputeConfig | None = None  # as typed, for work on other machines; None: as here
 

@@ -29,7 +29,7 @@ class ExitCode(IntEnum):
 
 
 class ReconError(Exception):
-    """A failure that the user can act on; `hint` says what to type or change next."""
+    """A failure that the user can act on; `hint` names the command to type or the change."""
 
     exit_code: ExitCode = ExitCode.BUG
     usual_hint = ""  # of a class whose members all call for the same; others give one each
@@ -91,7 +91,7 @@ class ManifestError(WorkspaceError):
 
 
 class FormatError(InputError):
-    """A file does not hold what its format promises."""
+    """A file does not conform to its format."""
 
     usual_hint = "Copy the file again, or write it anew with the program that made it."
 

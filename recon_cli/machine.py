@@ -59,7 +59,7 @@ def free_memory_bytes() -> int:
 
 
 def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
-    """Returns the CPU's model name from Linux's /proc/cpuinfo, or what Python knows elsewhere."""
+    """Returns the CPU's model name from Linux's /proc/cpuinfo, or from Python elsewhere."""
     if cpuinfo.exists():
         for line in cpuinfo.read_text(encoding="utf-8").splitlines():
             key, _, value = line.partition(":")
@@ -69,7 +69,7 @@ def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
 
 
 def cache_root() -> Path:
-    """Returns the folder for what recon keeps between runs: RECON_CACHE_DIR, or the platform's."""
+    """Returns the folder of recon's caches: RECON_CACHE_DIR, or the platform's."""
     folder = os.environ.get("RECON_CACHE_DIR")
     if folder:
         return Path(folder)
@@ -81,7 +81,7 @@ def cache_root() -> Path:
 
 
 def yield_to_others() -> None:
-    """Lowers the priority of this process: it takes what others leave of the cores."""
+    """Lowers the priority of this process, so that it uses idle cores only."""
     process = psutil.Process()
     process.nice(psutil.BELOW_NORMAL_PRIORITY_CLASS if sys.platform == "win32" else _LOW_PRIORITY)
 

@@ -1,4 +1,4 @@
-"""Processes of Python that recon starts: of its own code alone, whatever lies beside the data.
+"""Processes of Python that recon starts: of its own code alone, never of files beside the data.
 
 `python -m` and `python -c` look for modules in the current folder first, which is often one with
 data of others: a numpy.py there would be run. Nothing else in the package starts a program.
@@ -75,7 +75,7 @@ def ask_to_end(process: subprocess.Popen[bytes]) -> None:
 
 
 def run_code(code: str) -> str:
-    """Runs Python code in a process of its own and returns what it prints."""
+    """Runs Python code in a process of its own and returns its output."""
     return subprocess.run(
         python_command("-c", code), env=child_environment(), capture_output=True, text=True,
         check=True).stdout

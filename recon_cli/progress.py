@@ -75,7 +75,7 @@ def hide_bars() -> Iterator[None]:
 
 
 class TqdmProgress:
-    """Bars on stderr; one line every 20 seconds where stderr is no terminal."""
+    """Bars on stderr; one line every 20 seconds where stderr is not a terminal."""
 
     @contextmanager
     def bar(self, label: str, total: int, *, unit: str = "it", done: int = 0) -> Iterator[Bar]:

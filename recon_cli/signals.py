@@ -2,7 +2,7 @@
 
 Windows has no SIGHUP; Ctrl-Break and the end of a console stand for SIGTERM there.
 
-The first one raises `Interrupted` in the main thread, so that what is unfinished is saved and
+The first one raises `Interrupted` in the main thread, so that unfinished work is saved and
 children end. Programs such as `timeout` send it twice, so another one counts only a while later: it
 ends the process at once, and with it its children, whose standard input ends.
 """
@@ -42,14 +42,14 @@ def exit_code(error: BaseException | None) -> int:
 
 
 def describe_end(error: BaseException | None) -> str:
-    """Returns the line that says why a command ended, and how to go on."""
+    """Returns the line that says why a command ended, and how to continue."""
     number = exit_code(error) - ExitCode.SIGNAL
-    what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-    return f"{what}; run the same command again to resume"
+    reason = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+    return f"{reason}; run the same command again to resume"
 
 
 class _Watch:
-    """What has become of the signals so far."""
+    """The signals received so far."""
 
     def __init__(self) -> None:
         self.number = 0  # of the first one

@@ -25,7 +25,7 @@ ARGUMENTS = [
     "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-# What a software WebGL says about its own speed, which is no fault of the page.
+# What a software WebGL says about its own speed, which the page cannot help.
 HARMLESS = ("GPU stall due to ReadPixels", "Automatic fallback to software WebGL")
 
 

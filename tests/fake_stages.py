@@ -29,7 +29,7 @@ from recon_cli.workspace.summaries import JsonRecord
 
 @dataclasses.dataclass(frozen=True)
 class FakeSummary(JsonRecord):
-    """What every fake stage returns."""
+    """The summary of every fake stage."""
 
     steps: int
     length: float

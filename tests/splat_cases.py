@@ -89,7 +89,7 @@ def damaged(data: bytes, seed: int) -> bytes:
 
 
 def read_or_refused(read, path, data: bytes) -> bool:
-    """Whether a reader takes a file's bytes; warnings and other errors than FormatError go on."""
+    """Whether a reader takes a file's bytes; errors other than FormatError pass through."""
     path.write_bytes(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

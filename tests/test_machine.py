@@ -1,4 +1,4 @@
-"""What the machine tells about itself."""
+"""The facts on the machine."""
 
 from pathlib import Path
 

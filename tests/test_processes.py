@@ -54,7 +54,7 @@ def test_only_one_module_starts_programs():
     found = {(path.relative_to(PACKAGE).as_posix(), name)
              for path in PACKAGE.rglob("*.py") for name in starts(path)}
     assert {where for where, _ in found - KNOWN} == {"processes.py"}
-    assert found >= KNOWN  # the list is no longer than it has to be
+    assert found >= KNOWN  # the list names only files that need it
 
 
 def test_every_program_that_is_started_is_python_with_a_safe_path():

@@ -1,4 +1,4 @@
-"""What ends a command: one line, the exit code of a shell, and nothing that goes on."""
+"""Signals that end a command: one line, a shell's exit code, no process left."""
 
 import os
 import signal

@@ -14,7 +14,7 @@ from recon_cli.capture.foreign import recognise_file
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.errors import InputError
 
-# First bytes, where they are, and what unpacks such a file into a folder.
+# First bytes, their offset, and the command that unpacks such a file into a folder.
 _UNPACK = "mkdir -p {folder} && {command} && recon ingest {folder}"
 _SIGNATURES: tuple[tuple[bytes, int, str], ...] = (
     (b"PK\x03\x04", 0, "unzip {file} -d {folder}"),
@@ -80,7 +80,7 @@ def _ingest_beside(path: Path) -> str:
 
 
 def _unpacking(path: Path) -> str | None:
-    """Returns what unpacks an archive, None for other files."""
+    """Returns the command that unpacks an archive, None for other files."""
     with suppress(OSError):
         if path.is_file():
             with path.open("rb") as file:

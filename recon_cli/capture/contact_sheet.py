@@ -76,7 +76,7 @@ class ContactSheet:
             self._thumbs[index] = _thumbnail(rgb, self._layout.thumb)
 
     def write(self, path: Path, held_out: Collection[str]) -> None:
-        """Draws the sheet as a PNG, whole or not at all; `held_out` are names of stored frames."""
+        """Draws the sheet as a PNG, atomically; `held_out` are names of stored frames."""
         width, height = self._layout.cell
         columns = min(self._layout.columns, max(1, len(self._sample)))
         head = _wrap(self._heading(held_out), max(columns * width, 4 * width))
@@ -150,7 +150,7 @@ def _encode(canvas: Image.Image) -> bytes:
 
 
 def _thumbnail(rgb: NDArray[np.uint8], size: tuple[int, int]) -> Image.Image:
-    """Returns a picture [H, W, 3] reduced to fit into `size`, whatever its orientation."""
+    """Returns a picture [H, W, 3] reduced to fit into `size`, in any orientation."""
     height, width = rgb.shape[:2]
     scale = min(size[0] / width, size[1] / height)
     fitted = max(1, round(width * scale)), max(1, round(height * scale))
@@ -180,7 +180,7 @@ def _choose_sample(candidates: Sequence[FrameCandidate], most: int) -> list[Fram
     dropped = sum(map(len, by_reason.values()))
     room = {Reason.KEPT: min(len(chosen), max(int(KEPT_SHARE * most), most - dropped))}
     left = most - room[Reason.KEPT]
-    # The rarest reason first: what it does not need goes to the others.
+    # The rarest reason first: its unused share goes to the others.
     for place, reason in enumerate(sorted(by_reason, key=lambda name: len(by_reason[name]))):
         room[reason] = min(len(by_reason[reason]), left // (len(by_reason) - place))
         left -= room[reason]
@@ -192,7 +192,7 @@ def _choose_sample(candidates: Sequence[FrameCandidate], most: int) -> list[Fram
 
 
 def _wrap(words: Words, width: int) -> list[Words]:
-    """Returns texts in lines that are no wider than `width` where possible."""
+    """Returns texts in lines that are not wider than `width` where possible."""
     font = ImageFont.load_default(TEXT)
     lines: list[Words] = [[]]
     used = 0.0

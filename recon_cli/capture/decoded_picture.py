@@ -163,7 +163,7 @@ class DecodedPicture:
     def gray(self) -> NDArray[np.uint8]:
         """Returns the frame's gray values, upright, [H, W]; of HDR those of neutral colours.
 
-        They weight R, G and B as BT.601 does, whatever the matrix: swscale's gray has no other.
+        They weight R, G and B as BT.601 does, for any matrix: swscale's gray has no other.
         """
         gray = self._reformat("gray", Colorspace.ITU601 if self._untagged() else None)
         if self.tags.transfer is not None:

@@ -1,7 +1,7 @@
-"""What other programs leave beside pictures and no reader here takes: one table of it.
+"""One table of the files of other programs that lie beside pictures and are not read.
 
-A row says what it is, how it is recognised, what it carries and what to type instead. Whoever
-writes a reader for one of them removes its row. Data sets that are read are in `layouts`.
+A row holds a description, how the file is recognised, its content and the command to type instead.
+A new reader for one of them replaces its row. Data sets that are read are in `layouts`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _NERFSTUDIO = "ns-process-data {kind} --data {folder} {more}--output-dir SCENE"
 
 @dataclass(frozen=True)
 class ForeignLayout:
-    """What one program or app writes."""
+    """The files of one program or app."""
 
-    words: str  # what it is, in a sentence
+    words: str  # a description in a sentence
     carries: str  # what would be lost: "poses", "poses and depth"
     patterns: tuple[str, ...]  # of its files below the folder, the first that exists counts
     marks: tuple[bytes, ...] = ()  # all of them are in such a file; none: its name is enough
@@ -137,7 +137,7 @@ class Found:
 
     row: ForeignLayout
     folder: Path  # that was looked in
-    path: Path  # what it was recognised by
+    path: Path  # the file that identified it
 
     @property
     def place(self) -> str:
@@ -146,7 +146,7 @@ class Found:
         return inner.name if len(inner.parts) == 1 else f"{inner.parent.as_posix()}/"
 
     def advice(self) -> str:
-        """Returns what to type to use it, as a sentence; empty where nothing does it."""
+        """Returns a sentence with the command that uses it; empty without one."""
         names = {name: shlex.quote(str(path)) for name, path in (
             ("folder", self.folder), ("file", self.path), ("parent", self.path.parent))}
         steps = []
@@ -159,7 +159,7 @@ class Found:
         return f"To use them: {', or '.join(steps)}." if steps else ""
 
     def notice(self, where: Path) -> str:
-        """Returns what the user should know; `where` is the input that they gave."""
+        """Returns a notice for the user; `where` is the input that they gave."""
         place = self.place if self.folder == where else self.path
         return (f"{place} is {self.row.words}: its {self.row.carries} are not read, and "
                 f"the cameras are found from the pictures. {self.advice()}").rstrip()

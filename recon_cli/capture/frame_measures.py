@@ -1,4 +1,4 @@
-"""What is measured of every frame: sharpness, exposure, and how far the view moved."""
+"""Measures of every frame: sharpness, exposure, and how far the view moved."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def check_exposure(
          "bare walls cannot be reconstructed."))
     kind, hit, hint = next((row for row in kinds if row[1].sum() * 2 > len(black)), kinds[-1])
     raise InputError(
-        f"{name} is {kind}: {int(hit.sum())} of its {len(black)} {unit} are. Only {usable} show "
+        f"{name} is {kind}: {int(hit.sum())} of its {len(black)} {unit}. Only {usable} show "
         f"anything that can be matched, but at least {least} are needed.", hint=hint)
 
 
@@ -146,7 +146,7 @@ def measure_sharpness(
 ) -> float:
     """Returns the variance of the Laplacian of a gray frame [H, W] at a common size.
 
-    `hidden` [h, w], at any size, leaves out what shows nothing of the scene.
+    `hidden` [h, w], at any size, leaves out pixels that do not show the scene.
     """
     scale = SHARPNESS_SIZE / max(gray.shape)
     if scale < 1:

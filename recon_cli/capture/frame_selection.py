@@ -3,7 +3,7 @@
 From a video: locally sharp frames, spread evenly over the camera's path, one of those that show the
 same picture. Frames that are mostly black or blown out count as blurred; the best of them bridge
 gaps. Photos are all kept, except those that show nothing or the same view as another: where one of
-two equal views is held out, a model is tested on what it was trained on.
+two equal views is held out, a model is tested on its own training data.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ NAMED = 8  # photos that a message lists; all are in the record of the selection
 
 
 class Reason(StrEnum):
-    """What became of a frame."""
+    """The decision on a frame."""
 
     KEPT = "kept"
     DAMAGED = "damaged"
@@ -115,7 +115,7 @@ def judge_frames(
     lengths: NDArray[np.float64],  # [F], `path_length`
     sharpness: NDArray[np.float64],  # [F]
     exposures: NDArray[np.float64],  # [F, 3], rows of `measure_exposure`
-    whole: NDArray[np.bool_],  # [F], False for damaged frames
+    intact: NDArray[np.bool_],  # [F], False for damaged frames
     share: float,
     least: int = 0,
 ) -> Judgement:
@@ -125,13 +125,14 @@ def judge_frames(
     """
     sharp, exposed = sharp_frames(sharpness, share), well_exposed(exposures)
     filled = has_content(exposures)
-    good, possible = sharp & exposed & filled, whole & filled
+    good, possible = sharp & exposed & filled, intact & filled
     usable = bridge_gaps(lengths, sharpness, good, possible)
     blurred = np.flatnonzero(possible & exposed & ~usable)
     sharpest = np.argsort(-sharpness[blurred], kind="stable")
     usable[blurred[sharpest[:max(0, least - int(usable.sum()))]]] = True
     reasons = np.select(
-        [usable, ~whole, ~(exposed & filled)], ["", Reason.DAMAGED, Reason.CLIPPED], Reason.BLURRED)
+        [usable, ~intact, ~(exposed & filled)], ["", Reason.DAMAGED, Reason.CLIPPED],
+        Reason.BLURRED)
     refused = tuple(Reason(reason) if reason else None for reason in reasons.tolist())
     return Judgement(usable, usable & ~good, refused)
 
@@ -170,18 +171,18 @@ def bridge_gaps(
     lengths: NDArray[np.float64],  # [F]
     sharpness: NDArray[np.float64],  # [F]
     sharp: NDArray[np.bool_],  # [F]
-    whole: NDArray[np.bool_],  # [F]
+    intact: NDArray[np.bool_],  # [F]
 ) -> NDArray[np.bool_]:  # [F]
-    """Returns the sharp whole frames and those that are needed to close gaps between them.
+    """Returns the sharp intact frames and those that are needed to close gaps between them.
 
-    A gap of more than `MAX_GAP` is halved by the sharpest whole frame of its middle half, or by one
+    A gap of more than `MAX_GAP` is halved by the sharpest intact frame of its middle half, or by a
     elsewhere in it that is much sharper, until the gaps are closed or hold no more frames.
     """
-    usable = sharp & whole
+    usable = sharp & intact
     gaps = list(pairwise(np.flatnonzero(usable).tolist()))
     while gaps:
         first, last = gaps.pop()
-        inside = first + 1 + np.flatnonzero(whole[first + 1:last])
+        inside = first + 1 + np.flatnonzero(intact[first + 1:last])
         if lengths[last] - lengths[first] <= MAX_GAP or not len(inside):
             continue
         off_centre = np.abs(lengths[inside] - (lengths[first] + lengths[last]) / 2)
@@ -353,7 +354,7 @@ def choose_beside(
     chosen: Mapping[int, PhotoMeasures | None], beside: Mapping[int, PhotoMeasures | None],
     sources: Sequence[str], names: Sequence[str],
 ) -> dict[int, FrameCandidate]:
-    """Returns, by place, what becomes of photos that lie beside the chosen ones of a sequence.
+    """Returns, by place, the decision on photos that lie beside the chosen ones of a sequence.
 
     They are kept, except those that cannot be read, show nothing, or show what a kept one shows.
     """

@@ -1,7 +1,7 @@
 """Frames of photos: all that can be read and show a view of their own.
 
 Photos that follow each other are chosen like the frames of a video, by `photo_sequence`, and get
-tracks; those that show nothing of what the others show are set aside.
+tracks; those that share nothing with the others are set aside.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _find_sequence(
 
 
 def _visible_tracks(taken: _TakenPhotos, frames: Sequence[Frame], out: Path) -> Tracks | None:
-    """Returns the tracks through the frames, without what their masks hide."""
+    """Returns the tracks through the frames, without masked points."""
     tracks = taken.tracks
     if tracks is None:
         return None
@@ -141,17 +141,17 @@ class _PhotoSource:
     names: tuple[str, ...]  # of their frames
     masks: Mapping[str, Path]  # by file name
     plan: RawPlan
-    broken: Mapping[str, str]  # why other files are no photos, by file name
+    broken: Mapping[str, str]  # why other files are not photos, by file name
     white: int  # the brightest value of those with 16 bits
 
 
 @dataclass(frozen=True)
 class _TakenPhotos:
-    """What became of the photos of a folder."""
+    """The decisions on the photos of a folder."""
 
     record: Record
     broken: Mapping[str, str]  # why some cannot be read, by file name
-    dropped: frozenset[str]  # that show nothing, or the same as others; of a sequence it is no news
+    dropped: frozenset[str]  # that show nothing, or the same as others; not reported for a sequence
     tracks: Tracks | None = None  # through the photos that follow each other, by their frames
     sharpness: Mapping[str, float] = field(default_factory=dict)  # of these, by file name
 
@@ -205,7 +205,7 @@ def _take_from_sequence(
 def _choose_followed(
     config: IngestConfig, source: _PhotoSource, sequence: PhotoSequence, ctx: IngestContext
 ) -> tuple[dict[int, FrameCandidate], Tracks]:
-    """Returns what becomes of the photos of a sequence, by place, and the tracks through them."""
+    """Returns the decisions on the photos of a sequence, by place, and the tracks through them."""
     count = config.frames or frame_selection.automatic_count(
         frame_selection.path_length(sequence.scan.motion), most=config.max_frames, least=MIN_KEPT)
     video = judge(config, source.path, sequence.scan, ctx, least=count)
@@ -260,15 +260,15 @@ def _list_photos(
     for folder in dict.fromkeys((path, home)):
         for text in find_lists(folder, [photo.name for photo in photos], known=taken):
             notices.append(
-                f"{text.name} names the photos and is not read: what it says of them (such as "
-                "places or angles) is not used.")
+                f"{text.name} names the photos and is not read: its data on them (such as "
+                "places or angles) are not used.")
     for notice in (*notices, *left_out):
         ctx.notice(notice)
     return path, home, PhotoFolder(photos, found.broken)
 
 
 def _describe_beside(paths: Sequence[Path], home: Path) -> list[str]:
-    """Returns what lies beside photos that were given as files, and is not used."""
+    """Returns the unused files that lie beside photos that were given as files."""
     if len({path.absolute().parent for path in paths}) > 1:
         return []
     masks = [f"{folder} is not used with files; give {home} to use it."
@@ -299,7 +299,7 @@ def _find_masks(
         ctx.notice(f"Masks without a photo are left out: {names}.")
     if masks.unused and not masks.by_photo:
         ctx.notice(
-            f"No mask is used: that of {photos[0].name} must be called "
+            f"No mask is used: the mask of {photos[0].name} must be called "
             f"{photos[0].path.stem}.png or {photos[0].name}.png.")
     return masks
 

@@ -49,7 +49,7 @@ class ScannedVideo:
 def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
     """Returns a video after a pass over all of its frames; `scan_file` keeps it for a next run.
 
-    InputError if it is no video, has too few whole frames, shows nothing, or shows no motion.
+    InputError if it is not a video, has too few undamaged frames, or shows nothing or no motion.
     """
     if scan_file.exists():
         scan = Scan.read(scan_file)
@@ -59,8 +59,8 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     if scan.overlay is not None:
         picture = scan_file.name.replace(SCAN, PICTURE)
         ctx.notice(
-            f"{float(scan.overlay.mean()):.1%} of the picture of {path.name} is fixed to the "
-            "camera (text, a logo, dirt on the lens) and is masked in all of its frames; "
+            f"An overlay (text, a logo, dirt on the lens) stays in place in {path.name}: "
+            f"{float(scan.overlay.mean()):.1%} of the picture is masked in all frames; "
             f"{picture} in the folder of ingest shows where. --overlays keep leaves it in.")
     for notice in scan.notices:
         ctx.notice(notice)
@@ -71,23 +71,23 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
 def judge(
     config: IngestConfig, path: Path, scan: Scan, ctx: IngestContext, *, least: int = 0
 ) -> ScannedVideo:
-    """Returns what a scan says of its frames; InputError if they show nothing, or no motion.
+    """Judges the frames of a scan; InputError if they show nothing, or no motion.
 
     Where fewer than `least` are sharp, the sharpest of the others may be chosen, too.
     """
-    check_exposure(path.name, scan.exposure[scan.whole], least=frame_selection.MIN_FRAMES)
-    whole = int(scan.whole.sum())
-    clipped = whole - int(well_exposed(scan.exposure[scan.whole]).sum())
-    if 2 * clipped > whole:  # the rest cannot replace what they showed
+    check_exposure(path.name, scan.exposure[scan.intact], least=frame_selection.MIN_FRAMES)
+    intact = int(scan.intact.sum())
+    clipped = intact - int(well_exposed(scan.exposure[scan.intact]).sum())
+    if 2 * clipped > intact:  # the rest cannot replace what they showed
         ctx.notice(
-            f"{clipped} of {whole} frames of {path.name} are left out: they are mostly black or "
+            f"{clipped} of {intact} frames of {path.name} are left out: they are mostly black or "
             "blown out.")
     warning = frame_selection.check_motion(path.name, scan.motion)
     if warning:
         ctx.notice(warning)
     lengths = frame_selection.path_length(scan.motion)
     judgement = frame_selection.judge_frames(
-        lengths, scan.sharpness, scan.exposure, scan.whole, config.sharpness, least)
+        lengths, scan.sharpness, scan.exposure, scan.intact, config.sharpness, least)
     tracks = scan.tracks if scan.overlay is None else scan.tracks.outside(scan.overlay)
     return ScannedVideo(path, scan, lengths, judgement, pick_representatives(
         find_stills(tracks, scan.width, scan.height), scan.sharpness, judgement.usable,
@@ -95,7 +95,7 @@ def judge(
 
 
 def _scan(config: IngestConfig, path: Path, ctx: IngestContext) -> Scan:
-    """Returns the scan of a video; with an overlay that is to be masked, of what else it shows."""
+    """Returns the scan of a video; an overlay that is to be masked is left out of it."""
     claim = read_declared_length(path)
     with ctx.progress.bar("scan", claim.count(claim.rate), unit="frame") as bar:
         scan = scan_video(path, threads=ctx.threads, step=bar.advance)
@@ -107,14 +107,15 @@ def _scan(config: IngestConfig, path: Path, ctx: IngestContext) -> Scan:
             *scan.notices,
             f"{share:.0%} of the picture of {path.name} stays where it is while the rest moves; an "
             "overlay covers less, so that nothing is masked."))
-    with ctx.progress.bar("scan without overlay", len(scan.whole), unit="frame") as bar:
+    with ctx.progress.bar("scan without overlay", len(scan.intact), unit="frame") as bar:
         return measure_scene(path, scan, threads=ctx.threads, step=bar.advance)
 
 
 def frame_counts(config: IngestConfig, sources: Sequence[ScannedVideo]) -> list[int]:
     """Returns how many frames to choose from each video, at least `MIN_FRAMES`.
 
-    --frames, or what the motion needs up to --max-frames, is divided by the lengths of the paths.
+    --frames, or the number that the motion needs up to --max-frames, is divided by the lengths
+    of the paths.
     """
     wanted = [frame_selection.automatic_count(source.lengths, most=config.max_frames)
               for source in sources]
@@ -161,24 +162,24 @@ def ingest(
         for index, name in names.items())
     return IngestedSource(
         "video", (Group(path.name, width, height),), frames,
-        declared=scan.declared, decoded=int(scan.whole.sum()), lost=scan.lost,
-        blurred=int((scan.whole & ~judgement.usable).sum()),
+        declared=scan.declared, decoded=int(scan.intact.sum()), lost=scan.lost,
+        blurred=int((scan.intact & ~judgement.usable).sum()),
         selection=Selection(record, sheet, prefix), tracks=tracks.select(names))
 
 
 def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
     """Says how many frames are missing or damaged; refuses a video that has too few left."""
-    decoded, whole = len(scan.whole), int(scan.whole.sum())
-    if whole < frame_selection.MIN_FRAMES:
+    decoded, intact = len(scan.intact), int(scan.intact.sum())
+    if intact < frame_selection.MIN_FRAMES:
         raise InputError(
-            f"{path} has {whole} whole frames of {scan.expected}, but at least "
+            f"{path} has {intact} undamaged frames of {scan.expected}, but at least "
             f"{frame_selection.MIN_FRAMES} are needed.",
             hint="Give a longer video, or copy it from the camera again if it should be longer.")
     inexact = max(COUNT_SHARE * scan.declared, COUNT_FRAMES)
-    if whole < decoded or scan.gaps or scan.lost > inexact:
+    if intact < decoded or scan.gaps or scan.lost > inexact:
         ctx.notice(
             f"{path.name} is damaged or cut off: {scan.lost} of {scan.expected} frames are lost, "
-            f"{whole} can be used.")
+            f"{intact} can be used.")
     elif 0 < scan.declared < decoded - inexact:
         ctx.notice(f"{path.name} declares {scan.declared} frames but holds {decoded}.")
 
@@ -187,11 +188,12 @@ def report_short(
     source: ScannedVideo, chosen: int, requested: int | None, ctx: IngestContext
 ) -> None:
     """Says why fewer frames were chosen than requested; refuses too few."""
-    whole, usable, distinct = (
-        int(flags.sum()) for flags in (source.scan.whole, source.judgement.usable, source.distinct))
+    intact, usable, distinct = (
+        int(flags.sum())
+        for flags in (source.scan.intact, source.judgement.usable, source.distinct))
     if usable < frame_selection.MIN_FRAMES:
         raise InputError(
-            f"Only {usable} of {whole} frames are sharp, but at least "
+            f"Only {usable} of {intact} frames are sharp, but at least "
             f"{frame_selection.MIN_FRAMES} are needed.",
             hint="Lower --sharpness, or record again with slower movements.")
     if distinct < frame_selection.MIN_FRAMES:
@@ -201,16 +203,16 @@ def report_short(
             hint="Record again while you walk sideways through the room.")
     if requested is None or chosen == requested:
         return
-    if whole < requested:
-        ctx.notice(f"{requested} frames were requested, but {source.path.name} has {whole}.")
+    if intact < requested:
+        ctx.notice(f"{requested} frames were requested, but {source.path.name} has {intact}.")
     if distinct < usable:
         ctx.notice(
             f"Only {distinct} of {usable} frames show different pictures, and all of those are "
             "used; the others repeat one of them.")
-    if usable < whole:
+    if usable < intact:
         used = ", and all of them are used" if distinct == usable else ""
         ctx.notice(
-            f"Only {usable} of {whole} frames are sharp enough{used}; --sharpness 0 uses blurred "
+            f"Only {usable} of {intact} frames are sharp enough{used}; --sharpness 0 uses blurred "
             "ones too.")
 
 

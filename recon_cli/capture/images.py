@@ -1,6 +1,6 @@
 """One photo: its upright size, its lens by EXIF, and its pixels as 8-bit RGB.
 
-Pillow reads photos, LibRaw the headers of camera RAW. A photo is read whole or refused with an
+Pillow reads photos, LibRaw the headers of camera RAW. A photo is read completely or refused with an
 InputError. Colours become sRGB by the embedded profile.
 """
 
@@ -36,7 +36,7 @@ RAW_SUFFIXES = frozenset({
 # What cameras and converters write. Pillow also opens documents (EPS by way of Ghostscript).
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM")
 ANIMATED = frozenset({"WEBP", "PNG", "AVIF", "HEIF"})  # those that may hold a film, or a burst
-# A file with one of these endings that cannot be read is a broken photo; any other is no photo.
+# A file with one of these endings that cannot be read is a broken photo; any other is not a photo.
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
     ".ppm", ".tif", ".tiff", ".webp"}
@@ -80,11 +80,11 @@ class Photo:
     mode: str = "RGB"  # Pillow's, of the file
     wide: bool = False  # its values have 16 bits
     pictures: int = 1  # of an animation, of which the first one is read
-    panorama: bool = False  # its metadata says that it is no picture of a pinhole camera
+    panorama: bool = False  # its metadata says that no pinhole camera took it
 
     @property
     def name(self) -> str:
-        """What it is called in messages and records, unique within a capture."""
+        """Its name in messages and records, unique within a capture."""
         return self.label or self.path.name
 
     @property
@@ -254,7 +254,7 @@ def find_white(paths: Iterable[Path]) -> int:
     """Returns the brightest value that pictures of 16 bits can hold: 65535, or less.
 
     Cameras of 8 to 14 bits store their values in 16 without scaling them: then no picture of a set
-    has a value above 4095, say. What cannot be read is left to whoever needs it.
+    has a value above 4095, say. Unreadable files are left to their reader.
     """
     brightest = 0
     for path in paths:

@@ -1,4 +1,4 @@
-"""The result of ingesting one source, whatever its kind, and the context that this needs."""
+"""The result of ingesting one source of any kind, and the context that this needs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class IngestedSource:
     groups: tuple[Group, ...]  # of frames that share intrinsics
     frames: tuple[Frame, ...]  # sorted by name; their groups count within this source
     declared: int  # images that the source claims to hold, 0 where it does not say
-    decoded: int  # whole ones that it gave
+    decoded: int  # undamaged ones that it gave
     lost: int  # broken or missing ones
     blurred: int = 0  # those that were too blurred or badly exposed
     skipped: tuple[str, ...] = ()  # names of files that were left out

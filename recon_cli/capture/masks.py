@@ -78,7 +78,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     if not mask.any():
         raise InputError(
             f"The mask {path.name} ignores every pixel: its brightest value is {gray.max()}, but "
-            "255 marks what counts.",
+            "255 marks the pixels that count.",
             hint="Write masks with 0 and 255, or remove the photo.")
     return mask
 
@@ -122,7 +122,7 @@ def photo_mask(
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
-    """Writes a mask [H, W] as 8-bit gray PNG, whole or not at all, and makes its folder."""
+    """Writes a mask [H, W] as 8-bit gray PNG, atomically, and makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(".png", mask)
     atomic.write_bytes(path, data.tobytes())

@@ -1,6 +1,6 @@
-"""360-degree panoramas among photos: told by their metadata, or by what they show.
+"""360-degree panoramas among photos: told by their metadata, or by their content.
 
-A panorama is no picture of a pinhole camera: taken for one it gives wrong cameras, or none.
+A panorama is not taken by a pinhole camera: treated as such it gives wrong cameras or none.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Photos that follow each other, such as the frames of a video that somebody has dumped.
 
 Names say in which order they may have been taken, and the pictures whether they were: where nearly
-all neighbours show the same corners, the photos are a walk, whatever its steps. It is scanned and
-thinned by the means of videos. Photos that were taken one by one, on purpose, are left as they are.
+all neighbours show the same corners, the photos are a walk with steps of any size. It is scanned
+and thinned by the means of videos. Photos that were taken one by one, on purpose, are left as they
+are.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class PhotoSequence:
 
     @classmethod
     def read(cls, record: Path, photos: Sequence[Photo]) -> PhotoSequence | None:
-        """Returns what `write` wrote; None where it is missing, damaged or of other photos."""
+        """Reads the file of `write`; None where it is missing, damaged or of other photos."""
         if not record.exists():
             return None
         try:
@@ -80,7 +81,7 @@ class PhotoSequence:
                 tuple(map(int, value["places"])), scan, tuple(map(int, value["strangers"])))
         except (AttributeError, KeyError, TypeError, ValueError, OSError, FormatError):
             return None
-        return known if len(known.places) == len(scan.whole) else None
+        return known if len(known.places) == len(scan.intact) else None
 
     def among(self, kept: Sequence[int]) -> PhotoSequence:
         """Returns the sequence among fewer photos, which hold all of it, given by place."""
@@ -118,8 +119,8 @@ def find_sequence(
 def list_runs(photos: Sequence[Photo]) -> list[list[int]]:
     """Returns the photos whose names may be in the order in which they were taken, by place.
 
-    Those of a run are of one camera and folder, and their names differ in numbers alone. So few
-    that none would be left out are no run, nor are those that were taken more than a second apart.
+    The photos of a run are of one camera and folder, and their names differ in numbers alone. Too
+    few to leave any out, or taken more than a second apart, they are not a run.
     """
     camera = {photo.name: index for index, group in enumerate(group_photos(photos))
               for photo in group.photos}
@@ -159,7 +160,7 @@ def _read_time(photo: Photo) -> datetime | None:
             detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
         return datetime.strptime(
             str(detail.get(ExifTags.Base.DateTimeOriginal)), "%Y:%m:%d %H:%M:%S")
-    except BROKEN:  # a ValueError where it is no time
+    except BROKEN:  # a ValueError where it is not a time
         return None
 
 
@@ -186,14 +187,14 @@ def _scan_run(
         measured = measure_sequence(
             grays([place for place in measured.places if place not in strangers]), len(run),
             least=least)
-        assert measured is not None, "a sequence is one without what interrupts it"
+        assert measured is not None, "a sequence is one without interruptions"
     photo = photos[measured.places[0]]
     return PhotoSequence(
         tuple(measured.places), measured.scan(photo.width, photo.height), tuple(strangers))
 
 
 class MeasuredPhotos:
-    """What is measured of gray photos, one after the other, as of the frames of a video."""
+    """Measures of gray photos, one after the other, as of the frames of a video."""
 
     def __init__(self, least: float = FOLLOWED) -> None:
         self._least = least
@@ -231,7 +232,8 @@ class MeasuredPhotos:
             width=width, height=height, declared=count, gaps=0,
             sharpness=np.array(sharpness, np.float64), motion=np.array(motion, np.float64),
             exposure=np.round(exposure, 4), seconds=(None,) * count,
-            whole=np.ones(count, np.bool_), tracks=self._tracker.tracks(), overlay=None, notices=())
+            intact=np.ones(count, np.bool_), tracks=self._tracker.tracks(), overlay=None,
+            notices=())
 
 
 def measure_sequence(
@@ -262,7 +264,7 @@ def _join(parts: Sequence[PhotoSequence]) -> PhotoSequence:
         sharpness=np.concatenate([scan.sharpness for scan in scans]),
         motion=np.concatenate([scan.motion for scan in scans]),
         exposure=np.concatenate([scan.exposure for scan in scans]), seconds=(None,) * count,
-        whole=np.ones(count, np.bool_), tracks=merge_tracks([scan.tracks for scan in scans]),
+        intact=np.ones(count, np.bool_), tracks=merge_tracks([scan.tracks for scan in scans]),
         overlay=None, notices=())
     return PhotoSequence(
         tuple(place for part in parts for place in part.places), scan,

@@ -1,7 +1,7 @@
-"""Which pictures below a folder are the photos of a capture, and what else lies there.
+"""Which pictures below a folder are the photos of a capture, and the other files there.
 
 All pictures below the folder are photos, but for masks, depth and the like, reduced copies, and
-what `io.foreign` says is none. What is left out is named, with what to type.
+the pictures that `capture.foreign` lists. Those left out are named, with the command to type.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class PhotoTree:
 
 @dataclass
 class _Walk:
-    """What was found below a folder."""
+    """The photos and other files found below a folder."""
 
     folders: dict[Path, list[Path]] = field(default_factory=dict)  # with photos, by folder
     aside: dict[Path, tuple[str, int]] = field(default_factory=dict)  # kind and number of pictures
@@ -101,7 +101,7 @@ def _describe_aside(
 ) -> Iterator[str]:
     """Yields which folders with pictures are left out, and how to use them.
 
-    `told` is what the programs that are named anyway have written.
+    `told` are the files of programs that are named anyway.
     """
     for place, (kind, count) in sorted(walk.aside.items()):
         if kind in ("depth maps", "confidence maps") and any("depth" in text for text in told):
@@ -120,7 +120,7 @@ def _describe_aside(
 
 
 def describe_unused(folder: Path, used: Collection[Path], layout: str) -> list[str]:
-    """Returns what lies in the folder of a data set and is not used: depth, masks, other poses."""
+    """Returns the unused files in the folder of a data set: depth, masks, other poses."""
     notices = []
     for path in _subfolders(folder, None):
         kind, count = picture_kind(path.name), _count_pictures(path)
@@ -157,7 +157,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def _find_foreign(folder: Path) -> list[Found]:
-    """Returns what other programs left in a folder, and above one that is called like photos."""
+    """Returns other programs' files in a folder, and above one that is called like photos."""
     resolved = folder.resolve()
     above = resolved.parent
     found = find_foreign(folder)
@@ -233,7 +233,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Returns what a folder holds, hidden files apart; nothing where it may not be read."""
+    """Returns the entries of a folder, without hidden files; none where it may not be read."""
     with suppress(PermissionError):
         return sorted(path for path in folder.iterdir() if path.name[0] != ".")
     return []

@@ -26,7 +26,7 @@ SAME_FOCAL = 0.01
 
 @dataclass(frozen=True)
 class PhotoFolder:
-    """The photos of a folder in natural order (2 before 10), and what is broken."""
+    """The photos of a folder in natural order (2 before 10), and the broken files."""
 
     photos: tuple[Photo, ...]
     broken: dict[str, str]  # why a file that is named like a photo cannot be read, by its name
@@ -107,7 +107,7 @@ def _drop_depth_and_masks(
 
 
 def _other_kind(photo: Photo) -> str:
-    """Returns what a picture of one channel shows instead of colours, "" for nothing else."""
+    """Returns the content of a picture of one channel (a mask, depth), "" for an ordinary photo."""
     if photo.mode in _COLOURED:
         return ""
     if photo.mode[0] in "IF":
@@ -151,7 +151,7 @@ def check_count(folder: Path, photos: Sequence[Photo], broken: dict[str, str]) -
 
 
 def _count_hint(folder: Path) -> str:
-    """Returns what to give instead of a folder with too few photos: a video in it, if there is."""
+    """Returns the input to give instead of a folder with too few photos: a video in it, if any."""
     videos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES
                     and path.is_file()) if folder.is_dir() else []
     if videos:

@@ -1,4 +1,4 @@
-"""What a picture shows, by the name of its file or folder, where it is not the scene's colours."""
+"""Names of files and folders whose pictures do not show the scene's colours: depth, masks."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ _NAMES = {kind: re.compile(rf"(?:^|[^a-z])(?:{words})(?:$|[^a-z])", re.IGNORECAS
 
 
 def picture_kind(name: str) -> str:
-    """Returns what pictures of such a name show instead of the scene, "" for nothing else."""
+    """Returns the content of pictures of such a name (a mask, depth), "" for the scene itself."""
     return next((kind for kind, pattern in _NAMES.items() if pattern.search(name)), "")

@@ -2,7 +2,7 @@
 
 EXIF gives the exposure precisely enough, but converters lose it or copy it wrongly. The brightness
 of shared points in overlapping photos gives it too, with noise that adds up along a chain of
-photos. So EXIF is used unless the pixels clearly contradict it, and pixels replace what is missing.
+photos. So EXIF is used unless the pixels clearly contradict it, and pixels replace missing values.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class RawMeasures:
     """Measures of a small linear view of a photo; the views themselves would fill the memory."""
 
     points: NDArray[np.float32]  # [K, 2], its key points in pixels of the view
-    descriptors: NDArray[np.uint8]  # [K, 128], SIFT in whole numbers
+    descriptors: NDArray[np.uint8]  # [K, 128], SIFT as integers
     levels: NDArray[np.float64]  # [K], log2 of the mean green around, NaN if clipped or too dark
     brightest: NDArray[np.float32]  # [P], highest channel, 1 for saturation, infinite if clipped
 

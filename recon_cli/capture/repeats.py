@@ -43,7 +43,7 @@ def measure_shift(
     start: NDArray[np.float64],  # [K, 2]
     end: NDArray[np.float64],  # [K, 2]
 ) -> float:
-    """Returns the root mean square of what corners move together, by an affine map.
+    """Returns the root mean square of the corners' common motion, by an affine map.
 
     What they move on their own is the noise of following them, which adds up over a long rest.
     """

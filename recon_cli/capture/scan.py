@@ -1,4 +1,4 @@
-"""One pass over all frames of a video: their measures, tracks, and which of them are whole."""
+"""One pass over all frames of a video: their measures, tracks, and which of them are intact."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from recon_cli.errors import InputError
 from recon_cli.io.tracks import Tracks
 from recon_cli.workspace import atomic
 
-# B-frames in a row: x264's presets write up to 8. HEVC encoders mark whole groups as B.
+# B-frames in a row: x264's presets write up to 8. HEVC encoders mark entire groups as B.
 MAX_B_RUN = 8
 
 
@@ -39,7 +39,7 @@ class Scan:
     exposure: NDArray[np.float64]  # [F, 3], rows of `measure_exposure`
     seconds: tuple[float | None, ...]  # presentation times, None where unknown
     # [F], False from a lost or damaged packet to the next key frame
-    whole: NDArray[np.bool_]
+    intact: NDArray[np.bool_]
     tracks: Tracks  # of corners through all frames
     # [h, w] at a reduced size, where something is fixed to the camera; None if nowhere
     overlay: NDArray[np.bool_] | None
@@ -48,18 +48,19 @@ class Scan:
     @property
     def expected(self) -> int:
         """How many frames there should be."""
-        return max(self.declared, len(self.whole) + self.gaps)
+        return max(self.declared, len(self.intact) + self.gaps)
 
     @property
     def lost(self) -> int:
         """How many frames are missing or broken."""
-        return self.expected - int(self.whole.sum())
+        return self.expected - int(self.intact.sum())
 
     def write(self, path: Path) -> None:
         """Writes the measures as JSON, NaN as null, and tracks and overlay beside them."""
         values = {
             name: value.tolist() if isinstance(value, np.ndarray) else value
             for name, value in vars(self).items() if name not in ("tracks", "overlay")}
+        values["whole"] = values.pop("intact")  # the key in the file
         motion = [None if np.isnan(step) else step for step in values["motion"]]
         self.tracks.write(path.with_suffix(".safetensors"))
         if self.overlay is not None:
@@ -72,6 +73,7 @@ class Scan:
     def read(cls, path: Path) -> Scan:
         """Returns the scan that `write` wrote."""
         value: dict[str, Any] = atomic.read_json(path, dict)
+        intact = np.array(value.pop("whole"), np.bool_)
         overlay = None
         if value["overlay"]:
             data = np.frombuffer(atomic.read_bytes(path.with_suffix(".png")), np.uint8)
@@ -83,7 +85,7 @@ class Scan:
             "motion": np.array(value["motion"], np.float64),  # null becomes NaN
             "exposure": np.array(value["exposure"], np.float64).reshape(-1, 3),
             "seconds": tuple(value["seconds"]),
-            "whole": np.array(value["whole"], np.bool_), "notices": tuple(value["notices"])})
+            "intact": intact, "notices": tuple(value["notices"])})
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     """Returns the scan of a video, the same for any number of threads; calls `step` per frame.
 
     A damaged stream is scanned again by one thread, which alone is reproducible around the damage.
-    InputError if the file is no video, or no frame of it can be decoded.
+    InputError if the file is not a video, or none of its frames can be decoded.
     """
     scan = _scan_once(path, threads=threads, step=step)
     if scan.lost and threads > 1:
@@ -165,7 +167,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         motion=np.array([frame.motion for frame in measures], np.float64),
         exposure=np.round([frame.exposure for frame in measures], 4),
         seconds=tuple(frame.seconds for frame in measures),
-        whole=_find_whole(measures, gaps), tracks=tracker.tracks(), overlay=overlay.overlay(),
+        intact=_find_intact(measures, gaps), tracks=tracker.tracks(), overlay=overlay.overlay(),
         notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))
 
 
@@ -202,30 +204,31 @@ def _frame_rate(measures: Sequence[_FrameMeasures]) -> float:
     return (len(measures) - 1) / (last - first)
 
 
-def _find_whole(
+def _find_intact(
     measures: Sequence[_FrameMeasures], gaps: Sequence[tuple[int, int | None]]
 ) -> NDArray[np.bool_]:  # [F]
     """Returns False for each frame that depends, directly or not, on lost data."""
-    whole = np.ones(len(measures), np.bool_)
+    intact = np.ones(len(measures), np.bool_)
     for index, frame in enumerate(measures):
         if frame.corrupt:
-            _spoil(whole, measures, index, index + 1)
-    near = np.zeros(len(measures) + 2, np.bool_)  # one more before the first and after the last
+            _spoil(intact, measures, index, index + 1)
+    # one more before the first and after the last
+    beside_damage = np.zeros(len(measures) + 2, np.bool_)
     for count, pts in gaps:
         after = count
         if pts is not None:
             after = next(
                 (i for i, frame in enumerate(measures) if (frame.pts or 0) > pts), len(measures))
-        _spoil(whole, measures, after, after)
-        near[after:after + 2] = True
+        _spoil(intact, measures, after, after)
+        beside_damage[after:after + 2] = True
     # Deinterlacing uses the frames on both sides.
-    near[2:] |= ~whole
-    near[:-2] |= ~whole
-    return whole & ~(near[1:-1] & [frame.interlaced for frame in measures])
+    beside_damage[2:] |= ~intact
+    beside_damage[:-2] |= ~intact
+    return intact & ~(beside_damage[1:-1] & [frame.interlaced for frame in measures])
 
 
 def _spoil(
-    whole: NDArray[np.bool_], measures: Sequence[_FrameMeasures], first: int, search: int
+    intact: NDArray[np.bool_], measures: Sequence[_FrameMeasures], first: int, search: int
 ) -> None:
     """Clears the frames from `first` to the next key frame at or after `search`."""
     end = next((i for i in range(search, len(measures)) if measures[i].key), len(measures))
@@ -233,7 +236,7 @@ def _spoil(
     earliest = max(0, first - MAX_B_RUN)
     while first > earliest and measures[first - 1].bidirectional:
         first -= 1
-    whole[first:end] = False
+    intact[first:end] = False
 
 
 def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Finds what is fixed to the camera: text, logos, dirt on the lens, the bonnet of a car.
+"""Finds overlays that stay in place in every frame: text, logos, dirt on the lens, a bonnet.
 
 While the view moves, the edges of a scene pass over a pixel in all directions and cancel each other
 in the mean; those of an overlay add up, in every part of the video. Views are compared only once
@@ -152,7 +152,7 @@ def mask_overlay(
 
 
 def draw_overlay(frame: Path, mask: NDArray[np.uint8], path: Path) -> None:
-    """Writes the picture of a frame in which what its mask [H, W] leaves out is red."""
+    """Writes the picture of a frame with the pixels that its mask [H, W] leaves out in red."""
     rgb = read_image(frame, mask.shape[1], mask.shape[0]).astype(np.float32)
     rgb[mask == 0] = (rgb[mask == 0] + _TINT) / 2
     write_png(path, rgb.astype(np.uint8))

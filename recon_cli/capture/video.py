@@ -52,7 +52,7 @@ NAMES = {
 
 @contextmanager
 def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Yields the container and the video stream of a file, whatever its suffix.
+    """Yields the container and the video stream of a file with any suffix.
 
     InputError if the file is missing, not readable, no video, or a single picture.
     """
@@ -89,7 +89,7 @@ def _truncated(path: Path) -> InputError:
 
 
 def _video_stream(path: Path, container: InputContainer) -> VideoStream:
-    """Returns the first video stream that is no cover."""
+    """Returns the first video stream that is not a cover."""
     moving = moving_pictures(container)
     for stream in moving:
         if stream.codec_context is not None:
@@ -133,7 +133,7 @@ class DeclaredLength:
     rate: float  # frames per second; a rough guess where the rate varies
 
     def count(self, rate: float) -> int:
-        """Returns the number of frames there should be, by the duration where there is no count."""
+        """Returns the number of frames that the header declares, or the duration implies."""
         return self.frames or round(self.seconds * rate)
 
 

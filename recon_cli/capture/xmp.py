@@ -1,4 +1,4 @@
-"""What a picture's XMP says of its projection, as cameras and stitchers of panoramas write it."""
+"""Reads a picture's projection from its XMP, as cameras and stitchers of panoramas write it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_xmp(image: Image.Image) -> bytes:
 
 
 def is_panorama(xmp: bytes, width: int, height: int) -> bool:
-    """Returns whether a picture's XMP says that it is no perspective picture.
+    """Returns whether a picture's XMP says that it is not a perspective picture.
 
     Pictures cut from a panorama often keep its XMP: then their shape is another.
     """

@@ -34,7 +34,7 @@ def _check_assignments(
 @options.executor("Captures")
 @click.option(
     "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
-    help="Also prune in mid-training.  [default: on]")
+    help="Also prune midway through training.  [default: on]")
 @click.option(
     "--set", "assignments", multiple=True, metavar="SECTION.FIELD=VALUE",
     callback=_check_assignments,
@@ -53,8 +53,8 @@ def batch(
     """Reconstruct many captures, each in a workspace of its own.
 
     Each INPUT (a video, a folder of photos, a data set with poses) is a capture, reconstructed as
-    by `recon run` in DIR/<name of INPUT>. Failures stop no other capture. The same command goes on
-    with what is unfinished. The exit code is 0 only if every capture has a scene.
+    by `recon run` in DIR/<name of INPUT>. Rerun the command to finish the rest. A failed capture
+    does not stop the others. The exit code is 0 only if every capture has a scene.
     """
     compute = settings.build(ComputeConfig, call.settings)
     words = [word for text in assignments for word in ("--set", text)]
@@ -87,7 +87,7 @@ def batch(
     if failed:
         raise ReconstructionError(
             describe_failures(failed, len(results), "captures"),
-            hint=f"The reasons are in {page}, too; the same command tries these again.")
+            hint=f"The reasons are in {page}, too; rerun the command to try these again.")
 
 
 def _report(result: CaptureResult) -> None:

@@ -1,4 +1,4 @@
-"""What every command prints on stderr: the log, errors and hints."""
+"""The log, errors and hints that every command prints on stderr."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def show_log(
 
 
 def print_error(message: str, hint: str) -> None:
-    """Prints an error and what to type next."""
+    """Prints an error and the hint."""
     click.echo(f"error: {message}", err=True)
     if hint:
         click.echo(f"hint: {hint}", err=True)
@@ -66,7 +66,7 @@ def usage_hint(error: click.ClickException) -> str:
 
 
 def silence() -> None:
-    """Sends what is still to be printed nowhere: the reader of stdout or stderr is gone."""
+    """Drops pending output: the reader of stdout or stderr is gone."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         try:

@@ -35,7 +35,7 @@ def doctor(call: Call, as_json: bool) -> None:
 
 @dataclass(frozen=True)
 class Findings:
-    """What `recon doctor --json` prints under these names."""
+    """The facts that `recon doctor --json` prints under these names."""
 
     versions: dict[str, str]  # of Python, recon and the packages that matter
     device: str  # the GPU by name, or "cpu"
@@ -50,7 +50,7 @@ class Findings:
 
 
 def examine(workspace: Path) -> Findings:
-    """Returns what this machine has, and `workspace`, which need not exist."""
+    """Returns the facts on this machine, and on `workspace`, which need not exist."""
     import torch
 
     from recon_cli.render import registry

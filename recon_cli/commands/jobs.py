@@ -1,15 +1,15 @@
-"""What verbs share: a job made from the options, stages brought up to date, what is printed."""
+"""Shared by verbs: make a job of the options, bring stages up to date, print the outcome."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import click
 
 from recon_cli.commands.options import Call, explicit_settings
+from recon_cli.commands.sentences import describe_summary, fresh_files
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig
@@ -20,6 +20,7 @@ from recon_cli.pipeline.continuation import Start
 from recon_cli.pipeline.plan import Job, Outcome, Target
 from recon_cli.progress import TqdmProgress, format_duration
 from recon_cli.stages import IMPORT, STAGES, Stage
+from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.layout import Workspace
 
 logger = logging.getLogger("recon")
@@ -50,7 +51,7 @@ def run_stages(
         callbacks)
     start = Start.IMPORTED if call.from_import else Start.AUTO
     targets = [
-        Target(row.name, config, sources if row.takes else (),
+        Target(row.name, config, sources if row.input_metavar else (),
                start if row.name == IMPORT.name else Start.AUTO)
         for row, config in zip(rows, configs.values(), strict=True)]
     plan.run(job, verb, targets, again=call.again)
@@ -73,48 +74,24 @@ def open_job_with(call: Call, kind: type[C]) -> tuple[Job, C]:
 
 
 def report_outcome(outcome: Outcome) -> None:
-    """Prints one line about a stage: its summary, or that it is up to date."""
+    """Prints one line about a stage: its result, or that it is up to date."""
+    run = outcome.manifest.run
     if outcome.ran:
-        run = outcome.manifest.run
-        summary = ": ".join(filter(None, [outcome.stage, summary_text(run.summary)]))
-        click.echo(f"{summary} ({format_duration(run.seconds)})")
-    else:
-        record = outcome.manifest.run.summary
-        click.echo(": ".join(filter(None, [
-            f"{outcome.stage} is up to date", ", ".join(_fresh_files(record))])))
-        for notice in record.get("notices") or ():
-            logger.warning("%s", notice)
-
-
-def _fresh_files(summary: Mapping[str, Any]) -> list[str]:
-    """Returns the names of an export's files that are up to date; none of another stage."""
-    files = summary.get("files") or {}
-    if not files:
-        return []
-    return [summary["file"], *(one["file"] for one in files.values() if not one.get("stale"))]
-
-
-def summary_text(summary: Mapping[str, Any]) -> str:
-    """Returns a stage's summary on one line: numbers and words, no lists, nothing that is empty."""
-    parts = [
-        f"{name.replace('_', ' ')} {_value_text(value)}" for name, value in summary.items()
-        if value is not None and value != "" and not isinstance(value, (list, dict))]
-    others = _fresh_files(summary)[1:]
-    return ", ".join([*parts, f"also {', '.join(others)}"] if others else parts)
-
-
-def _value_text(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int):
-        return f"{value:,}"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+        sentence = describe_summary(outcome.stage, run.summary)
+        click.echo(f"{': '.join(filter(None, [outcome.stage, sentence]))} "
+                   f"({format_duration(run.seconds)})")
+        return
+    files = (fresh_files(ExportSummary.from_json(run.summary))
+             if outcome.stage == "export" and run.summary.get("files") else [])
+    click.echo(": ".join(filter(None, [f"{outcome.stage} is up to date", ", ".join(files)])))
+    for notice in run.summary.get("notices") or ():
+        logger.warning("%s", notice)
 
 
 def open_executor(
     place: str, jobs: int | None, compute: ComputeConfig, folder: Path, inputs: Sequence[Path] = ()
 ) -> tuple[Executor, int]:
-    """Returns what runs commands on `folder`, and how many threads each of them has."""
+    """Returns the executor of commands on `folder`, and how many threads each command has."""
     return start_executor(
         place, folder, inputs=inputs, slots=jobs, cores=compute.threads,
         gpu=NEEDS_GPU[compute.device])

@@ -1,7 +1,7 @@
 """Command-line options: those that every verb has, and those made from the config dataclasses.
 
 An option stores its value in a `Call` and is passed to no function. A config field therefore is
-declared once, in config/stages.py, and only what was typed reaches the settings.
+declared once, in config/stages.py, and only typed options reach the settings.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _METAVARS = {int: "N", float: "X", str: "TEXT"}
 
 @dataclass
 class Call:
-    """What was typed, collected option by option."""
+    """The typed command line, collected option by option."""
 
     workspace: Path = Path("workspace")  # of -w, RECON_WORKSPACE or the default
     config_file: Path | None = None
@@ -99,7 +99,7 @@ def _print_all(ctx: click.Context, _parameter: click.Parameter, value: bool) -> 
 
 
 class PathType(click.Path):
-    """A path that is no pipe, socket or device, and no longer than one may be."""
+    """A path that is not a pipe, socket or device, and not longer than the system allows."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(path_type=Path, **settings)
@@ -128,7 +128,7 @@ class Option(click.Option):
         return (f"--[no-]{self.opts[0][2:]}" if self.secondary_opts else name), text
 
     def get_help_extra(self, ctx: click.Context) -> OptionHelpExtra:
-        """Returns what click adds in brackets; the range of a number on the second page alone."""
+        """Returns click's additions in brackets; the range of a number on the second page alone."""
         extra = super().get_help_extra(ctx)
         if HELP_ALL not in ctx.meta:
             extra.pop("range", None)
@@ -141,7 +141,7 @@ def verb(name: str) -> Callable[[Command], Verb]:
 
 
 def explicit_settings(call: Call) -> Settings:
-    """Returns what recon.toml, --config and --set set; ConfigError if a value cannot be used."""
+    """Returns the values of recon.toml, --config and --set; ConfigError if one cannot be used."""
     in_workspace = call.workspace / FILE
     # A link that leads nowhere is an error, not the same as none.
     files = [in_workspace] if os.path.lexists(in_workspace) else []
@@ -201,13 +201,13 @@ def assignments(example: str = "train.iterations=1000") -> Decorator:
 
 def stage(config: type[StageConfig], *, renders: bool = False) -> Decorator:
     """Returns a decorator that adds a stage's options; device and backend where it `renders`."""
-    where = compute(trains=config in (TrainConfig, PruneConfig)) if renders else of(
+    where = compute(trains=config in (TrainConfig, PruneConfig)) if renders else config_options(
         ComputeConfig, only=("threads",))
-    return stack([of(config), where, again, print_config, common()])
+    return stack([config_options(config), where, again, print_config, common()])
 
 
-def executor(what: str) -> Decorator:
-    """Returns a decorator that adds where commands run, and how many (of `what`) at once."""
+def executor(jobs: str) -> Decorator:
+    """Returns a decorator that adds where commands run, and how many `jobs` (a plural) at once."""
     return stack([
         click.option(
             "--on", "place", type=click.Choice(["local", "ray"]), default="local",
@@ -215,15 +215,15 @@ def executor(what: str) -> Decorator:
                  "[default: local]"),
         click.option(
             "--jobs", type=click.IntRange(min=1), metavar="N",
-            help=f"{what} at once.  [default: one for each {CORES} cores]")])
+            help=f"{jobs} at once.  [default: one for each {CORES} cores]")])
 
 
 def compute(*, trains: bool = False, without: Sequence[str] = ()) -> Decorator:
     """Returns a decorator that adds where a verb computes, and the memory for one that trains."""
-    return of(ComputeConfig, without=(*without, *(() if trains else ("max_memory",))))
+    return config_options(ComputeConfig, without=(*without, *(() if trains else ("max_memory",))))
 
 
-def of(
+def config_options(
     config: type[StageConfig], *, only: Sequence[str] = (), without: Sequence[str] = (),
     expert: Sequence[str] = (), lead: str = "",
 ) -> Decorator:

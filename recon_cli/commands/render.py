@@ -15,7 +15,8 @@ from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TRAINING, Ren
 def _outputs(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[str, ...]:
     asked = text.split(",")
     if not set(asked) <= set(OUTPUTS):
-        raise click.BadParameter(f"{text!r} is no list of {', '.join(OUTPUTS)}.", param=parameter)
+        raise click.BadParameter(
+            f"{text!r} is not a list of {', '.join(OUTPUTS)}.", param=parameter)
     return tuple(output for output in OUTPUTS if output in asked)
 
 
@@ -28,15 +29,15 @@ def _color(
         red, green, blue = (int(word) for word in text.split(","))
     except ValueError as error:
         raise click.BadParameter(
-            f"{text!r} is no colour such as 255,255,255.", param=parameter) from error
+            f"{text!r} is not a colour such as 255,255,255.", param=parameter) from error
     return red, green, blue
 
 
 @verb("render")
 @click.option(
     "--path", metavar="training|orbit|FILE.json",
-    help="Camera path: smooth through the training cameras, a circle around what they look at, or "
-         "a camera path of nerfstudio's viewer.  [default: training]")
+    help="Camera path: smooth through the training cameras, a circle around their centre of "
+         "view, or a camera path of nerfstudio's viewer.  [default: training]")
 @click.option(
     "--views", multiple=True, metavar="test|train|validation|NAME",
     help="Render these views instead of a path: a set, or a frame by its name; may be repeated.  "
@@ -44,11 +45,12 @@ def _color(
 @click.option(
     "--output", "outputs", default=OUTPUTS[0], metavar="rgb,depth,alpha,trust", callback=_outputs,
     show_default=True,
-    help="What to write. Depth is a 16-bit image, in millimetres if the scale is known, and a "
-         "coloured one; trust likewise is the expected error. render.json says what they mean.")
+    help="Outputs to write. Depth is a 16-bit image, in millimetres if the scale is known, and a "
+         "coloured one; trust likewise is the expected error. render.json explains the values.")
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
-    help="Model to render; auto: pruned if it is fresh, else base.")
+    help="Model to render; auto: the compact one (pruned) if it is fresh, else the original "
+         "(base).")
 @click.option(
     "--format", "form", type=click.Choice(FORMATS),
     help="mp4 also makes a video of the frames.  [default: png, or mp4 if --out ends in .mp4]")

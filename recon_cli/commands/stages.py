@@ -26,7 +26,7 @@ from recon_cli.config.stages import (
 from recon_cli.stages import IMPORT, STAGES
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
-MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune while training goes on
+MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune midway through training
 # Fewer steps than a capture of one's own gets: this room scores as 3DGS does after them already.
 # Surfaces by stereo would take a tenth of the time, for less than steps gain in it.
 DEMO: Settings = {**MID, "train": {"iterations": 1700, "stereo": "off"}}
@@ -52,7 +52,7 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 @verb("denoise")
 @click.option(
     "--compare", is_flag=True,
-    help="Print what each filter would gain and lose on this capture, write compare.json into the "
+    help="Compare the filters on this capture: print gains and losses, write compare.json into the "
          "workspace, and exit.  [default: off]")
 @options.stage(DenoiseConfig)
 @pass_call
@@ -76,8 +76,9 @@ def sfm(call: Call) -> None:
 
 @verb("train")
 @click.option(
-    "--prune", "with_prune", is_flag=True, help="Also prune in mid-training.  [default: off]")
-@options.of(
+    "--prune", "with_prune", is_flag=True,
+    help="Also prune midway through training.  [default: off]")
+@options.config_options(
     PruneConfig, without=("at", "max_gaussians", "max_psnr_drop"),
     expert=("max_mb", "rounds", "score", "recovery"), lead="With --prune: ")
 @click.option(
@@ -121,14 +122,15 @@ def _parse_ratios(_ctx: click.Context, parameter: click.Parameter, text: str) ->
         ratios = ()
     if not ratios or not 0 < ratios[0] <= ratios[-1] < 1:
         raise click.BadParameter(
-            f"{text!r} is no list of fractions between 0 and 1, such as 0.5,0.8.", param=parameter)
+            f"{text!r} is not a list of fractions between 0 and 1, such as 0.5,0.8.",
+            param=parameter)
     return ratios
 
 
 @verb("prune")
 @click.option(
     "--sweep", is_flag=True,
-    help="Print what every score costs at every ratio on the validation views, with controls, "
+    help="Print the loss on the validation views for every score at every ratio, with controls, "
          "write sweep.json and sweep.svg into the workspace, and exit.  [default: off]")
 @click.option(
     "--ratios", default="0.5,0.66,0.8,0.9", metavar="X,X,...", callback=_parse_ratios,
@@ -191,7 +193,7 @@ def export(call: Call) -> None:
 @_inputs
 @click.option(
     "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
-    help="Also prune in mid-training.  [default: on]")
+    help="Also prune midway through training.  [default: on]")
 @options.assignments()
 @options.compute(trains=True)
 @options.again
@@ -201,7 +203,7 @@ def export(call: Call) -> None:
 def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
     """Run every stage from INPUT to the exported .ply.
 
-    INPUT is what `recon ingest` takes. Without it, the previous input is used.
+    INPUT is as for `recon ingest`. Without it, the previous input is used.
     """
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
     run_stages(call, "run", stages, sources=inputs, base=MID)

@@ -25,7 +25,8 @@ from recon_cli.workspace.layout import Workspace
 @click.argument("item", metavar="[ITEM]", required=False, type=options.PathType())
 @click.option(
     "--model", type=click.Choice(["auto", "base", "pruned"]), default="auto", show_default=True,
-    help="Model to show first; auto: pruned if it is fresh, else base.")
+    help="Model to show first; auto: the compact one (pruned) if it is fresh, else the "
+         "original (base).")
 @click.option(
     "--host", default="127.0.0.1", metavar="ADDRESS", show_default=True,
     help="Address to listen on; 0.0.0.0 accepts every machine that reaches this one.")

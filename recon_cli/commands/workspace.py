@@ -11,8 +11,9 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.jobs import open_job, summary_text
+from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.commands.sentences import describe_summary
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, StageStatus, free_space
 from recon_cli.progress import format_duration, format_megabytes
@@ -41,7 +42,7 @@ def status(call: Call, as_json: bool) -> None:
         _refuse_damaged(job, stages)
         return
     if not job.workspace.root.exists():
-        logger.warning("there is no workspace at %s yet", job.workspace.root)
+        logger.warning("no workspace at %s yet", job.workspace.root)
     click.echo(status_table(stages))
     for stage in stages:
         if stage.state == "fresh":
@@ -60,17 +61,18 @@ def _refuse_damaged(job: Job, stages: Sequence[StageStatus]) -> None:
 
 
 def status_table(stages: Sequence[StageStatus]) -> str:
-    """Returns stage, state, time, and reasons or summary, one line a stage."""
+    """Returns stage, state, time, and reasons or a sentence, one line a stage."""
     rows = [("stage", "state", "time", "")]
     for stage in stages:
         state = stage.state
         if state == "partial":
             state = f"partial ({describe_progress(stage.done, stage.total)})"
-        elif state == "fresh" and stage.total:  # a training that goes on from it
-            state = f"fresh, going on ({describe_progress(stage.done, stage.total)})"
+        elif state == "fresh" and stage.total:  # a training continues it
+            state = f"fresh, continuing ({describe_progress(stage.done, stage.total)})"
         time = "" if stage.seconds is None else format_duration(stage.seconds)
         rows.append((
-            stage.name, state, time, "; ".join(stage.reasons) or summary_text(stage.summary)))
+            stage.name, state, time,
+            "; ".join(stage.reasons) or describe_summary(stage.name, stage.summary)))
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True))
              for row in rows]
@@ -80,7 +82,7 @@ def status_table(stages: Sequence[StageStatus]) -> str:
 @verb("clean")
 @click.argument(
     "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice([row.name for row in STAGES]))
-@click.option("--dry-run", is_flag=True, help="Only print what would be removed.  [default: off]")
+@click.option("--dry-run", is_flag=True, help="Only list the files and sizes.  [default: off]")
 @options.common()
 @pass_call
 def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
@@ -92,7 +94,7 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
     job = Job(Workspace(call.workspace), table=STAGES)  # recon.toml may be damaged
     freed = free_space(job, stages, dry=dry_run)
     for item in freed:
-        link = " (a link; what it points to stays)" * item.is_link
+        link = " (a link; its target stays)" * item.is_link
         click.echo(f"{item.path}: {format_megabytes(item.size)}{link}")
     outcome = "would be freed" if dry_run else "freed"
     click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
@@ -107,8 +109,8 @@ def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
 def report(call: Call, out: Path | None) -> None:
     """Write an HTML report: capture, scores, views, settings.
 
-    It is one file that any browser opens without a network. No stage is run; the report names what
-    is missing or stale, with the command to type.
+    It is one file that any browser opens without a network. No stage is run; the report names
+    missing or stale results, with the command to type.
     """
     from recon_cli.report.build import write_report
 

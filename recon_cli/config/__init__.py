@@ -1,1 +1,1 @@
-"""What each stage can be told: one frozen dataclass a stage, and where values come from."""
+"""The options of each stage: one frozen dataclass a stage, and where values come from."""

@@ -17,12 +17,12 @@ from typing import Any, get_args, get_origin, get_type_hints
 from recon_cli.errors import ConfigError
 
 _SHOWN = 100  # characters of a value
-MOST = 2**31 - 1  # of any whole number: what COLMAP and others hold
+MOST = 2**31 - 1  # of any integer: the limit of COLMAP and others
 
 
 @dataclass(frozen=True)
 class OptionInfo:
-    """What is declared about a field besides its type and default."""
+    """The declaration of a field besides its type and default."""
 
     help: str  # one sentence
     unit: str = ""
@@ -47,7 +47,7 @@ def option(default: Any, help: str, **info: Any) -> Any:
 
 
 def option_info(item: dataclasses.Field[Any]) -> OptionInfo:
-    """Returns what `option` declared for a field."""
+    """Returns the declaration of `option` for a field."""
     info: OptionInfo = item.metadata["option"]
     return info
 
@@ -67,7 +67,7 @@ def field_type(config: type[StageConfig], name: str) -> tuple[type, bool]:
 
 
 def member_types(kind: Any) -> tuple[type, ...]:
-    """Returns the types of a tuple's members, (str, str, float); none where a field is no tuple."""
+    """Returns the types of a tuple's members, (str, str, float); empty for any other field."""
     return get_args(kind) if get_origin(kind) is tuple else ()
 
 

@@ -46,7 +46,7 @@ GONE: dict[str, dict[str, tuple[Any, ...]]] = {
 }
 
 FILE = "recon.toml"  # in the workspace
-Settings = dict[str, dict[str, Any]]  # section -> field -> value, only what was set
+Settings = dict[str, dict[str, Any]]  # section -> field -> value, explicit ones only
 C = TypeVar("C", bound=StageConfig)
 AUTOMATIC = "automatic"  # how None is written in --set
 _TRUTH = {"true": True, "false": False}
@@ -92,7 +92,7 @@ def _drop_gone(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_assignment(text: str) -> Settings:
-    """Returns what `section.field=value` sets, typed as the field is, or raises ConfigError."""
+    """Returns the setting of `section.field=value`, of the field's type, or raises ConfigError."""
     path, equals, value = text.partition("=")
     section, dot, name = path.strip().partition(".")
     if not equals or not dot:
@@ -148,7 +148,7 @@ def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> Non
         SECTIONS[section](**values)
     except ConfigError as error:
         raise ConfigError(f"{where}{error.message}", hint=error.hint) from error
-    except OverflowError as error:  # a whole number for a float
+    except OverflowError as error:  # an integer for a float
         raise ConfigError(
             f"{where.rstrip('.')}: a number has too many digits.",
             hint="Write a smaller one.") from error
@@ -169,7 +169,7 @@ def merge(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
 
 
 def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
-    """Returns the config of one class with what `settings` set."""
+    """Returns the config of one class with the values of `settings`."""
     return config(**settings.get(section_of(config), {}))
 
 

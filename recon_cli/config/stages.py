@@ -32,8 +32,8 @@ class IngestConfig(StageConfig):
         0.5, "Minimum sharpness of a video frame relative to its neighbours.", unit="share",
         minimum=0.0, maximum=1.0)
     overlays: str = option(
-        "mask", "What is fixed to the camera in a video (text, logos, dirt on the lens, a car's "
-        "bonnet): mask it or keep it.", choices=("mask", "keep"))
+"mask", "Text, logos, dirt on the lens or a car's bonnet that stay in place in every frame of a "
+        "video: mask or keep them.", choices=("mask", "keep"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,8 +86,8 @@ class SfmConfig(StageConfig):
         "keep", "Poses of a data set: keep them, refine them with the points, or ignore them.",
         choices=("keep", "refine", "ignore"))
     pairs: str = option(
-        "auto", "Image pairs to match. auto: what overlaps by first cameras, from a video's tracks "
-        "or photos' coarsest features; then more pairs and other mappers if the model is poor.",
+        "auto", "Image pairs to match. auto: pairs that a first rough reconstruction shows to "
+        "overlap; then more pairs and other mappers if the model is poor.",
         choices=("auto", "exhaustive", "retrieval", "sequential"))
     max_features: int = option(
         3000, "Maximum SIFT keypoints per image; the coarsest are kept.", unit="keypoints",
@@ -157,6 +157,7 @@ def _check_scale_between(value: tuple[str, str, float] | None) -> None:
             f"scale_between says {metres:g} metres, but it must be more than 0.", hint=hint)
 
 
+MODEL_LABELS = {"base": "original", "pruned": "compact"}  # the models as users read them
 MIN_GAUSSIANS = 4  # the first ones are as large as the mean distance to 3 neighbours
 _VALIDATION = "Share of views for validation."
 DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
@@ -164,7 +165,7 @@ DENSIFY_UNTIL = 0.6  # share of the run up to which the recipes add Gaussians
 
 @dataclass(frozen=True)
 class TrainConfig(StageConfig):
-    """How Gaussians are fitted; `train.plan` decides what is left automatic for a scene."""
+    """How Gaussians are fitted; `train.plan` decides automatic values for a scene."""
 
     quality: str = option(
         "normal", "Preset: 1500, 2400 or 8000 steps at 400, 600 or 800 pixels.",
@@ -175,7 +176,7 @@ class TrainConfig(StageConfig):
         "budget", "Add Gaussians where the error is (budget) or as 3DGS does (reference).",
         choices=("budget", "reference"))
     iterations: int | None = option(
-        None, "Optimization steps; more than those of a finished run go on from its end.",
+        None, "Optimization steps; a higher number than a finished run continues that run.",
         minimum=1, automatic="by --quality")
     batch_views: int = option(
         1, "Views per step; their mean gradient is used.", unit="views", minimum=1,
@@ -193,8 +194,8 @@ class TrainConfig(StageConfig):
         "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
         choices=("auto", "denoised", "original"))
     far: str = option(
-        "auto", "Add Gaussians where views show no points; auto: by a trial of validation PSNR.",
-        choices=("auto", "on", "off"))
+        "auto", "Add background Gaussians where there are no sparse points; auto: if a trial "
+        "improves validation PSNR.", choices=("auto", "on", "off"))
     stereo: str = option(
         "auto", "Start with Gaussians on surfaces that dense stereo finds and sparse points leave "
         "out; auto: on.",
@@ -207,18 +208,18 @@ class TrainConfig(StageConfig):
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
         expert=True)
     means_rate: float = option(
-        1.6e-4, "Initial learning rate of the means in scene extents; with budget 7 times as high "
-        "and in median distances of the points from the nearest camera. Decays to a hundredth.",
+        1.6e-4, "Initial learning rate of the means, in scene extents; budget: 7x, in units of the "
+        "median point-to-camera distance. Decays to a hundredth.",
         minimum=0.0, expert=True)
     quats_rate: float = option(1e-3, "Learning rate of the rotations.", minimum=0.0, expert=True)
     scales_rate: float = option(
-        5e-3, "Learning rate of the log-scales; 4 times as high with budget.", minimum=0.0,
+        5e-3, "Learning rate of the log-scales; budget: 4x.", minimum=0.0,
         expert=True)
     opacities_rate: float = option(
         5e-2, "Learning rate of the opacity logits.", minimum=0.0, expert=True)
     sh_rate: float = option(
-        2.5e-3, "Learning rate of the base colours; doubled with budget. Higher degrees use a "
-        "twentieth, with budget a fifth in every fourth step.", minimum=0.0, expert=True)
+        2.5e-3, "Learning rate of the base colours; budget: 2x. Higher degrees use a "
+        "twentieth; budget: a fifth in every fourth step.", minimum=0.0, expert=True)
     densify_every: int = option(
         100, "Interval between densification steps.", unit="steps", minimum=1, expert=True)
     densify_gradient: float = option(
@@ -227,7 +228,7 @@ class TrainConfig(StageConfig):
     min_opacity: float = option(
         0.005, "Delete Gaussians below this opacity.", minimum=0.0, maximum=1.0, expert=True)
     mid: float = option(
-        0.6, "Point of the run whose state is kept for pruning in mid-training.", unit="share",
+        0.6, "Point of the run whose state is kept for pruning midway.", unit="share",
         minimum=0.05, maximum=1.0, expert=True)
     seed: int = option(0, "Random seed.", minimum=0)
     blocks: str = option(
@@ -248,7 +249,7 @@ class TrainConfig(StageConfig):
         if self.mid < DENSIFY_UNTIL:
             raise ConfigError(
                 f"mid is {self.mid:g}, but densification runs until {DENSIFY_UNTIL:g} of the run "
-                "and would grow back what was pruned.",
+                "and would replace the pruned Gaussians.",
                 hint=f"Use --mid {DENSIFY_UNTIL:g} or more.")
         if self.iterations is not None and self.minutes is not None:
             raise ConfigError(
@@ -259,7 +260,7 @@ class TrainConfig(StageConfig):
 
 @dataclass(frozen=True)
 class RunConfig(TrainConfig):
-    """TrainConfig with numbers in place of what was automatic, as `train.plan` makes it."""
+    """TrainConfig with numbers in place of automatic values, as `train.plan` makes it."""
 
     iterations: int = option(2400, "Optimization steps.", minimum=1)
     max_size: int = option(600, "Longest image side.", unit="pixels", minimum=16)
@@ -268,7 +269,7 @@ class RunConfig(TrainConfig):
 
     @property
     def is_reference(self) -> bool:
-        """Whether this is the recipe of 3DGS (Kerbl et al. 2023), whatever the steps and images."""
+        """Whether this is the recipe of 3DGS (Kerbl et al. 2023), with any steps and images."""
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
                  "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
                  "sh_rate")
@@ -303,8 +304,8 @@ class PruneConfig(StageConfig):
     beta: float = option(
         0.1, "Volume exponent of the `paper` score (eq. 4).", minimum=0.0, expert=True)
     at: str = option(
-        "end", "Prune the finished model (end), or its state in mid-training and finish from there "
-        "(mid, as train --prune).", choices=("end", "mid"))
+        "end", "Prune the finished model (end), or a state midway through training and finish from "
+        "there (mid, as train --prune).", choices=("end", "mid"))
     recovery: int | None = option(
         None, "Fine-tuning steps after pruning, split over the rounds.", unit="steps", minimum=0,
         automatic="end: a sixth of the run or 6 epochs; mid: the rest of the run")
@@ -331,7 +332,7 @@ class EvaluateConfig(StageConfig):
         None, "Longest side of rendered and scored views.", unit="pixels", minimum=16,
         automatic="as in training")
     trust: bool = option(
-        True, "Measure where the scene can be trusted, and list what is poorly seen.")
+        True, "Measure where the scene can be trusted, and list the poorly seen regions.")
 
 
 def read_matrix(path: str) -> list[float]:
@@ -341,7 +342,7 @@ def read_matrix(path: str) -> list[float]:
             isinstance(row, list) and len(row) == 4
             and all(type(value) in (int, float) for value in row) for row in rows)):
         raise ConfigError(
-            f"{path} holds something else than a matrix of 4 rows of 4 numbers.",
+            f"{path} is not a matrix of 4 rows of 4 numbers.",
             hint="For example [[0.01, 0, 0, 0], [0, 0.01, 0, 0], [0, 0, 0.01, 0], [0, 0, 0, 1]].")
     return [float(value) for row in rows for value in row]
 
@@ -351,7 +352,8 @@ class ExportConfig(StageConfig):
     """Which model is exported, in which frame, and to which files."""
 
     model: str = option(
-        "auto", "Model to export; auto: pruned if it is fresh, else base.",
+        "auto", "Model to export; auto: the compact one (pruned) if it is fresh, else the "
+        "original (base).",
         choices=("auto", "base", "pruned"))
     scale_between: tuple[str, str, float] | None = option(
         None, SCALE_BETWEEN, metavar="A B METRES", automatic="the scale of the training")
@@ -370,7 +372,7 @@ class ExportConfig(StageConfig):
         metavar="X Y Z X Y Z", automatic="everything")
     drop_floaters: bool = option(
         False, "Remove Gaussians that no training view sees, or that at most two views see and "
-        "that hide what is behind them or make these views worse.")
+        "that cover surfaces behind them or make these views worse.")
     drop_islands: bool = option(
         False, "Remove small groups of Gaussians far from all others, unless seen through windows.")
     drop_backdrop: bool = option(
@@ -398,7 +400,7 @@ class ExportConfig(StageConfig):
         minimum=0.0, per_file=True, expert=True,
         automatic="1/128 of the median depth; 2 cm in a room")
     spz_version: int = option(
-        3, "Version of .spz: 3 is what most programs read; 2 is for older ones, with coarser "
+        3, "Version of .spz: 3 is read by most programs; 2 by older ones, with coarser "
         "rotations; 4 uses zstd.", minimum=2, maximum=4, per_file=True, expert=True)
 
     def __post_init__(self) -> None:
@@ -429,11 +431,11 @@ class ImportConfig(StageConfig):
         "this workspace; auto: the one that shows some training views better.",
         choices=("auto", "source", "workspace"))
     axes: str | None = option(
-        None, "Axes of the file, whatever it says: z-up and y-down say where up is if there are no "
-        "views; rdf (x right, y down, z front), rub (x right, y up, z back) and so on also turn "
-        "the scene to y-down, or z-up.",
+        None, "Axes of the file, in place of those that it states: z-up and y-down say where up is "
+        "without views; rdf (x right, y down, z front), rub (x right, y up, z back) and so on "
+        "also turn the scene to y-down, or z-up.",
         choices=("y-down", "z-up", "rdf", "rub", "luf", "ruf", "rfu", "rbu"),
-        automatic="what the file says, else y-down, as in viewers")
+        automatic="as the file states, else y-down, as in viewers")
     max_size: int = option(
         600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
@@ -452,4 +454,4 @@ class ComputeConfig(StageConfig):
         None, "CPU threads.", minimum=1, hashed=False, automatic="all cores")
     max_memory: float | None = option(
         None, "Memory that training may take; images that do not fit are read from the disk.",
-        unit="GB", minimum=0.1, hashed=False, automatic="what is free", expert=True)
+        unit="GB", minimum=0.1, hashed=False, automatic="all that is free", expert=True)

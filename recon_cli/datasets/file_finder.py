@@ -31,12 +31,12 @@ class FileFinder:
     def __init__(self, folder: Path, names: Sequence[object]) -> None:
         self._folder = folder
         self._names = names
-        self._moved: dict[str, Path] = {}  # the names that are no path in the folder
+        self._moved: dict[str, Path] = {}  # the names that are not a path in the folder
 
     def find(self, name: object, where: str) -> Path:
         """Returns the path of a file, which exists unless none has its name.
 
-        FormatError if `name` is no text, or leads out of the folder and no file has its name.
+        FormatError if `name` is not a string, or leads out of the folder and no file has its name.
         """
         try:
             path = with_suffix(resolve_inside(self._folder, name, where))
@@ -127,7 +127,7 @@ def _stem(name: str) -> str:
 
 
 def _kind(parts: Sequence[str]) -> str:
-    """Returns what the folders of a path say that its pictures show: a mask stands for no photo."""
+    """Returns the content of pictures by the folders of a path: a mask is not a photo."""
     return next((kind for part in parts[:-1] if (kind := picture_kind(part))), "")
 
 

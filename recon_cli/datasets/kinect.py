@@ -65,7 +65,7 @@ def is_tum(folder: Path) -> bool:
 
 
 def find_unposed(folder: Path) -> tuple[str, Path] | None:
-    """Returns what a folder of colours and depth without poses lacks, and what to give instead."""
+    """Returns the files that colours and depth without poses lack, and a better input."""
     if not is_seven_scenes(folder) and folder.is_dir() and all(
             next(folder.glob(f"frame-*.{kind}.*"), None) for kind in ("color", "depth")):
         return "7-Scenes frames without their .pose.txt", folder / "frame-*.color.*"
@@ -89,7 +89,7 @@ def read_seven_scenes(folder: Path) -> PosedSet:
     if not poses:
         raise InputError(
             f"{folder} has {len(colors)} frames like frame-000000.color.png, none of them with a "
-            ".pose.txt.", hint="Unpack the whole sequence into one folder.")
+            ".pose.txt.", hint="Unpack the complete sequence into one folder.")
     lens, depth_lens, notices = _kinect(folder, image_size(next(iter(colors.values()))))
     listed = []
     for number in poses:
@@ -151,9 +151,9 @@ def read_tum(folder: Path) -> PosedSet:
 
 
 def _read_rows(path: Path, least: int) -> list[list[str]]:
-    """Returns the words of each line that is no comment; each has at least so many."""
+    """Returns the words of each line, at least so many, without comments."""
     if not path.is_file():
-        raise FormatError(f"{path} is missing.", hint="Unpack the whole sequence again.")
+        raise FormatError(f"{path} is missing.", hint="Unpack the complete sequence again.")
     rows = []
     for at, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.split()

@@ -24,7 +24,7 @@ from recon_cli.datasets.rgbd import (
     read_scannet,
 )
 from recon_cli.datasets.transforms import is_transforms, read_transforms
-from recon_cli.errors import FormatError, InputError, list_names
+from recon_cli.errors import FormatError, InputError, format_count, list_names
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def read_posed(path: Path) -> PosedSet:
     layout = next((row for row in LAYOUTS if row.fits(path)), None)
     if layout is None:
         known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
-        raise InputError(f"{path} is no data set with poses.", hint=f"Known are {known}.")
+        raise InputError(f"{path} is not a data set with poses.", hint=f"Known are {known}.")
     try:
         return _attach_masks(layout.read(path), path if path.is_dir() else path.parent)
     except FormatError as error:
@@ -102,20 +102,16 @@ def describe(posed: PosedSet) -> str:
     words = next(row.words for row in LAYOUTS if row.name == posed.layout)
     held_out = sum(image.held_out for image in posed.images)
     depth = sum(image.depth is not None for image in posed.images if not image.held_out)
-    parts = [_count(len(posed.images) - held_out, "frame" if posed.sequence else "image")]
+    parts = [format_count(len(posed.images) - held_out, "frame" if posed.sequence else "image")]
     if depth:
         parts.append(f"{depth} with depth")
     if held_out:
-        parts.append(_count(held_out, "held-out view"))
+        parts.append(format_count(held_out, "held-out view"))
     if posed.points is not None:
-        parts.append(_count(len(posed.points), "point"))
+        parts.append(format_count(len(posed.points), "point"))
     if posed.missing:
-        parts.append(f"{_count(len(posed.missing), 'image')} missing")
+        parts.append(f"{format_count(len(posed.missing), 'image')} missing")
     return f"{words}: {', '.join(parts)}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def _attach_masks(posed: PosedSet, folder: Path) -> PosedSet:

@@ -1,4 +1,4 @@
-"""Data sets with known cameras: what their readers return, and the files that they list.
+"""Data sets with known cameras: the records of their readers, and the files that they list.
 
 A reader lists images with lenses and poses; `find_images` keeps those whose file exists, each with
 a lens of its size, as a `PosedSet`.
@@ -70,15 +70,15 @@ def _read_depth(path: Path) -> NDArray[np.generic]:
         if path.suffix.lower() == ".npy":
             values = np.asarray(np.load(path, allow_pickle=False))
         else:
-            # Not OpenCV, which returns the first rows of a damaged PNG as the whole.
+            # Not OpenCV, which returns the first rows of a damaged PNG without an error.
             with Image.open(path, formats=("PNG", "TIFF")) as image:
                 values = np.asarray(image)
     except (OSError, ValueError, EOFError, SyntaxError, struct.error, zlib.error) as error:
         raise FormatError(f"{path} cannot be read as depth: {error}.", hint=hint) from error
     if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
         raise FormatError(
-            f"{path} is no depth: it holds {values.dtype} of shape {values.shape}, needed one "
-            "value a pixel.", hint=hint)
+            f"{path} is not a depth image: it holds {values.dtype} of shape {values.shape}, "
+            "needed one value a pixel.", hint=hint)
     return values
 
 
@@ -125,7 +125,7 @@ class PosedSet:
     splits: bool = False  # it says itself which images are held out
     points: NDArray[np.float64] | None = None  # [P, 3] sparse points in its world, if it has any
     colors: NDArray[np.uint8] | None = None  # [P, 3] RGB of the points
-    notices: tuple[str, ...] = ()  # what the user should know about how it was read
+    notices: tuple[str, ...] = ()  # for the user, about how it was read
 
     @property
     def lenses(self) -> tuple[Lens, ...]:
@@ -166,7 +166,7 @@ def find_images(
         images.append(replace(item, lens=lens, depth=item.depth and replace(item.depth, lens=lens)))
     notices = []
     if missing:
-        notices.append(f"{len(missing)} of the {len(names)} images that it lists are missing, "
+        notices.append(f"missing: {len(missing)} of the {len(names)} images that it lists, "
                        f"the first is {missing[0]}")
     if factor != 1:
         notices.append(f"its images are {factor:.4g} times as large as its cameras say, so the "
@@ -185,7 +185,7 @@ def _check_sizes(items: Sequence[PosedImage], sizes: Sequence[tuple[int, int]]) 
             raise FormatError(
                 f"{item.path} is {width}x{height} pixels, but its camera "
                 f"{item.lens.width}x{item.lens.height}; most images are {factor:.4g} times as "
-                "wide as their cameras, which is no common factor.",
+                "wide as their cameras, which is not a common factor.",
                 hint="Use the images that the poses were made for, all of them or all reduced "
                 "by one factor; the size is that of the file, before any EXIF rotation.")
     return factor
@@ -217,7 +217,7 @@ def resolve_inside(folder: Path, name: object, where: str) -> Path:
 
     A data set may come from anywhere, so it may not name files elsewhere on the disk; links below
     the folder are followed. `name` has either kind of slash; `where` is its entry, for messages.
-    FormatError if `name` is no text, absolute, or leads out of the folder.
+    FormatError if `name` is not a string, is absolute, or leads out of the folder.
     """
     if not isinstance(name, str) or not name.strip() or "\0" in name:
         raise FormatError(f"{where} has no file name.")

@@ -7,7 +7,7 @@ views, which are held out for the score.
 
 ScanNet: color/<n>.jpg, depth/<n>.png in millimetres, pose/<n>.txt with a camera-to-world matrix
 (OpenCV axes, metres; -inf where tracking was lost), intrinsic/intrinsic_color.txt and
-intrinsic_depth.txt. It unprojects whole pixel indices, so its pixel centres lie at whole numbers.
+intrinsic_depth.txt. It unprojects integer pixel indices, so its pixel centres lie at integers.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from recon_cli.datasets.posed import (
     is_file,
     resolve_inside,
 )
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, format_count
 from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
 from recon_cli.scene.camera import Camera, Lens, make_lens
 from recon_cli.workspace.atomic import read_json, write_json
@@ -194,14 +194,14 @@ def _files(path: Path) -> list[tuple[Path, str | None]]:
 
 
 def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Returns what a file says of all frames, and its entries."""
+    """Returns a file's values for all frames, and its entries."""
     value = read_json(file, hint=_HINT, finite=False)
     entries = value.get("frames") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{file} lists no frames.", hint=_HINT)
     for at, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise FormatError(f"{file}, frame {at}, is no entry with names.", hint=_HINT)
+            raise FormatError(f"{file}, frame {at}, is not an object.", hint=_HINT)
     return {key: item for key, item in value.items() if key != "frames"}, entries
 
 
@@ -234,7 +234,7 @@ def _read_parts(shared: Mapping[str, Any], file: Path) -> dict[str, str] | None:
             f"{file} has val_filenames or test_filenames, but no train_filenames.", hint=_HINT)
     for part, names in lists.items():
         if names is not None and not isinstance(names, list):
-            raise FormatError(f"{file}: {part}_filenames is no list.", hint=_HINT)
+            raise FormatError(f"{file}: {part}_filenames is not a list.", hint=_HINT)
         parts.update({_plain(name): part for name in names or ()})
     return parts
 
@@ -260,7 +260,9 @@ def _drop_duplicates(frames: Sequence[_Frame]) -> tuple[list[_Frame], list[str]]
             unique[frame.path] = frame
     notices = []
     if copies:
-        notices.append(f"{len(copies)} images are listed more than once, the first is {copies[0]}")
+        notices.append(
+            f"listed more than once: {format_count(len(copies), 'image')}, the first is "
+            f"{copies[0]}")
     return list(unique.values()), notices
 
 
@@ -336,7 +338,7 @@ def write_transforms(
     path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = (),
     points: str | None = None,
 ) -> None:
-    """Writes the cameras of images, by paths below the folder of the file, whole or not at all.
+    """Writes the cameras of images, by paths below the folder of the file, atomically.
 
     Intrinsics that all cameras share are written once. With held-out paths the lists
     train_filenames, val_filenames and test_filenames are written; the last two are those images,
@@ -349,7 +351,7 @@ def write_transforms(
     names = [name for name, _ in views]
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise ValueError(f"{name} is no path below the folder of {path}")
+            raise ValueError(f"{name} is not a path below the folder of {path}")
     if len(set(names)) < len(names) or not set(held_out) <= set(names):
         raise ValueError("duplicate views, or held-out ones that do not exist")
     inner = [_intrinsics(camera) for _, camera in views]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
@@ -46,7 +47,7 @@ class ScoredModel:
     label: str  # in tables
     score: ModelMetrics  # on the held-out views
     digest: str  # of these views; scores can be paired where it is equal
-    kind: str = ""  # of a model of a workspace: base, pruned or 3DGS, as in tables
+    kind: str = ""  # of a model of a workspace, as in tables: original, compact or 3DGS
 
 
 def read_workspace_scores(name: str, folder: Path) -> list[ScoredModel]:
@@ -74,7 +75,7 @@ def score_file(
     splats = _undo_export(read_splats(path), path.with_name(_TRANSFORM))
     splats = splats.map(lambda tensor: tensor.to(ctx.device))
     scores = score_views(splats, views, splats.sh_degree, ctx.backend)
-    score = ModelMetrics.of(
+    score = ModelMetrics.from_views(
         scores.views, gaussians=len(splats), bytes=path.stat().st_size, render_ms=scores.render_ms)
     return ScoredModel(group, name, name, score, reference_digest(views))
 
@@ -140,7 +141,8 @@ def _paper_rows(models: Sequence[ScoredModel]) -> Table:
     kinds = {scored.kind for scored in models if scored.model == "base" and scored.group in groups}
     return paper_table(
         {group: (scores[group, "base"], scores[group, "pruned"]) for group in groups},
-        (kinds.pop() if len(kinds) == 1 else "base", "pruned"))
+        (kinds.pop() if len(kinds) == 1 else MODEL_LABELS["base"],
+         MODEL_LABELS["pruned"]))
 
 
 def _record(models: Sequence[ScoredModel]) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class Spread:
     deviation: float | None
 
     @staticmethod
-    def of(values: Sequence[float]) -> Spread:
+    def from_values(values: Sequence[float]) -> Spread:
         """Returns the spread of some values, at least one."""
         deviation = statistics.stdev(values) if len(values) > 1 else None
         return Spread(statistics.fmean(values), deviation)

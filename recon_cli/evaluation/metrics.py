@@ -81,7 +81,7 @@ def ssim(
         if not without_border(mask).any():
             raise ValueError("SSIM of a mask that leaves no pixel off the border")
         rendered = np.where(mask[..., None], rendered, true)
-    if padded:  # what is cropped below is then the padding
+    if padded:  # the crop below then removes the padding
         around = ((BORDER, BORDER), (BORDER, BORDER))
         rendered, true = (np.pad(pixels, (*around, (0, 0))) for pixels in (rendered, true))
         mask = None if mask is None else np.pad(mask, around)

@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.evaluation.intervals import Interval
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.summaries import JsonRecord
@@ -61,7 +62,7 @@ class ModelMetrics(JsonRecord):
     views: tuple[ViewScore, ...]
 
     @classmethod
-    def of(
+    def from_views(
         cls, views: tuple[ViewScore, ...], *, gaussians: int, bytes: int, render_ms: float,
         train_seconds: float | None = None, gain_psnr_db: float | None = None,
         seen_psnr_db: Mapping[str, float] | None = None,
@@ -79,7 +80,7 @@ class ModelMetrics(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics(JsonRecord):
-    """What evaluate leaves in metrics.json."""
+    """The content of metrics.json."""
 
     FILE: ClassVar[str] = "metrics.json"
 
@@ -116,8 +117,9 @@ class Metrics(JsonRecord):
                 f"{held_out or 'none'} of them held out{' and so not scored' * bool(held_out)}")
 
     def label(self, model: str) -> str:
-        """Returns what tables call a model: 3DGS only what was trained as 3DGS is."""
-        return self.base_recipe if model == "base" and self.base_recipe else model
+        """Returns the label of a model in tables: 3DGS only where it was trained as 3DGS is."""
+        return self.base_recipe if model == "base" and self.base_recipe else (
+            MODEL_LABELS.get(model, model))
 
     @classmethod
     def read(cls, evaluate: Path) -> Self:

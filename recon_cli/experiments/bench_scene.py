@@ -85,7 +85,8 @@ def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Cam
         "means": means, "quats": rng.normal([1, 0, 0, 0], [1e-9, 0.1, 0.1, 0.1], (n, 4)),
         "log_scales": np.log(scales), "logit_opacities": rng.normal(0.5, 2.0, n),
         "sh_dc": np.sin(means * [3, 5, 7]), "sh_rest": rng.normal(0, 0.05, (n, 15, 3))}
-    splats = Splats.of({k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()})
+    splats = Splats.from_parameters(
+        {k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()})
     # at eye height, looking into the far corner, slightly down
     forward = np.array([3.5, 2.0, -0.4]) / np.linalg.norm([3.5, 2.0, -0.4])
     right = np.cross(forward, [0, 0, 1.0])

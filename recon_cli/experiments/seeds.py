@@ -51,16 +51,17 @@ class SeedScores:
     def result(self) -> Result:
         """Returns mean and deviation of every figure, and the content of seeds.json."""
         def spreads(figures: Figures) -> dict[str, Any]:
-            return {name: {"values": list(values), **dataclasses.asdict(Spread.of(values))}
+            return {name: {"values": list(values), **dataclasses.asdict(
+                Spread.from_values(values))}
                     for name, values in figures.items()}
 
         def cells(figures: Figures, sign: str = "") -> list[str]:
-            return [Spread.of(values).text(sign + _FORMATS[name])
+            return [Spread.from_values(values).text(sign + _FORMATS[name])
                     for name, values in figures.items()]
 
         rows = [(self.kinds[name], *cells(figures)) for name, figures in self.models.items()]
         if self.difference:
-            rows.append(("pruned minus base", *cells(self.difference, "+")))
+            rows.append(("compact minus original", *cells(self.difference, "+")))
         return Result(
             {"seeds": list(self.seeds),
              "models": {name: spreads(figures) for name, figures in self.models.items()},

@@ -118,7 +118,7 @@ class StudyResult:
 
     def spread(self, row: str, comparison: str, variant: Variant, figure: str) -> Spread:
         """Returns mean and standard deviation over the seeds."""
-        return Spread.of(self.values(row, comparison, variant, figure))
+        return Spread.from_values(self.values(row, comparison, variant, figure))
 
     def difference(
         self, row: str, comparison: str, pair: tuple[Variant, Variant], figure: str

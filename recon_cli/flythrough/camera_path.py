@@ -80,12 +80,12 @@ def read_camera_path(path: Path) -> CameraPath:
             f"{path} has the camera type {kind!r}; only perspective cameras can be rendered.",
             hint="Export the path again with perspective cameras.")
     if value.get("crop") is not None:
-        logger.warning("%s: its crop is ignored, the whole scene is rendered", path)
+        logger.warning("%s: its crop is ignored, all of the scene is rendered", path)
     sides = {key: _read_number(value, key, str(path)) for key in ("render_width", "render_height")}
     for key, pixels in sides.items():
         if pixels < 1 or pixels != round(pixels):
             raise FormatError(
-                f"{path} has {key} = {pixels:g}; it must be a whole number of pixels.", hint=_HINT)
+                f"{path} has {key} = {pixels:g}; it must be an integer.", hint=_HINT)
     frames = [_read_frame(entry, f"{path}, camera {at},") for at, entry in enumerate(entries)]
     return CameraPath(
         np.stack([viewmat for viewmat, _ in frames]), np.array([fov for _, fov in frames]),

@@ -111,7 +111,7 @@ def _no_such_view(
             hint=f"Give {', '.join(parts)}, or the name of a frame such as {min(known)}.")
     close = difflib.get_close_matches(name, known, n=1)
     return ConfigError(
-        f"There is no view {name!r} among the {len(known)} of this capture.",
+        f"None of this capture's {len(known)} views is named {name!r}.",
         hint=f"Did you mean {close[0]}?" if close else (
             f"Give {', '.join(parts)}, or the name of a frame such as {min(known)}."))
 

@@ -171,7 +171,7 @@ class VideoEncoding:
 
 
 def check_encoding(encoding: VideoEncoding) -> None:
-    """Raises ConfigError if there is no encoder, or it rejects this size or rate."""
+    """Raises ConfigError without an encoder, or if it rejects this size or rate."""
     encoder = encoding.encoder()
     context = VideoCodecContext.create(encoder, "w")
     assert isinstance(context, VideoCodecContext)
@@ -191,7 +191,7 @@ def _restore_scheduling() -> Iterator[None]:
     """Restores the scheduling of this thread at the end.
 
     Where the user is root, as in a container, SVT-AV1 leaves the thread that opens it with
-    real-time priority: what spins there later would starve all others.
+    real-time priority: threads that spin there later would starve all others.
     """
     if not hasattr(os, "sched_getscheduler"):  # Linux alone has it
         yield

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from recon_cli.scene.camera import Camera, looking_at
 
 _SAMPLES = 20_000  # points that are projected at most
-_MIDDLE = 0.5  # of the picture's sides: the part that shows what a camera looks at
+_MIDDLE = 0.5  # of the picture's sides: the part that shows a camera's target
 _LEAST_RADIUS = 0.05  # of the median distance from the middle: cameras may all be above it
 # Standard deviation of the filter before the spline: a fortieth of the path, up to three cameras.
 # With the spline it reduces the radius of a circle of 24 cameras by 2.5%, of 96 cameras by 1.4%.

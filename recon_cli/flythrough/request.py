@@ -52,7 +52,7 @@ class RenderRequest:
 
     @property
     def file(self) -> Path | None:
-        """The camera path to read, if that is what --path names."""
+        """The camera path to read, if --path names one."""
         return Path(self.path) if self.path.lower().endswith(".json") else None
 
     @property

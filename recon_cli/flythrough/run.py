@@ -68,7 +68,7 @@ class FrameFolder:
     def prepare(self, settings: Mapping[str, Any], about: Mapping[str, Any]) -> tuple[str, ...]:
         """Prepares the folder for these settings and returns which frames are missing.
 
-        `settings` are JSON values of all that decides what a frame shows, `about` more of them for
+        `settings` are JSON values of all that decides a frame, `about` more of them for
         readers of the record. FormatError if the record of an earlier run is damaged.
         """
         settings = {"schema": _SCHEMA, **settings}
@@ -153,7 +153,7 @@ class FrameFolder:
 
 
 def render_frames(request: RenderRequest, job: Job) -> str:
-    """Renders the missing frames of a request and returns what was written, in words.
+    """Renders the missing frames of a request and describes the files written.
 
     StageError without a fresh model, ConfigError for a size, view or codec that cannot be used,
     FormatError for a damaged file, WorkspaceError for a folder that cannot be used.
@@ -238,7 +238,7 @@ def _make_folder(folder: Path) -> None:
 def _frame_settings(
     request: RenderRequest, plan: CameraPlan, trained: TrainedScene, scale: DepthScale
 ) -> dict[str, Any]:
-    """Returns everything that decides what a frame shows, as JSON values."""
+    """Returns everything that decides the pixels of a frame, as JSON values."""
     cameras = plan.cameras
     return {
         "model": trained.model, "gaussians": trained.digest, "sh_degree": trained.sh_degree,

@@ -1,4 +1,4 @@
-"""Reads the trained scene of a workspace: a model, its views, and what is known of the world."""
+"""Reads the trained scene of a workspace: a model, its views, and the facts on the world."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
     manifests = {name: _require_fresh(inspection, name, verb) for name in needs}
     if viewless and model == "pruned":
         raise StageError(
-            "There is no pruned model: a scene without views cannot be pruned.",
+            "This workspace has no compact (pruned) model: a scene without views cannot be pruned.",
             hint=NEEDS_VIEWS_HINT)
     pruned = not viewless and _use_pruned(inspection, model, verb)
     config = read_config(folder("train"))
@@ -108,8 +108,8 @@ def _use_pruned(inspection: WorkspaceCheck, model: str, verb: str) -> bool:
     check = inspection.check("prune")
     if model == "pruned" and not check.fresh:
         raise StageError(
-            f"{verb} needs the pruned model, which is {check.describe()}.",
+            f"{verb} needs the compact (pruned) model, which is {check.describe()}.",
             hint=f"Run `recon prune` first, or `recon {verb} --model base`.")
     if model == "auto" and check.manifest and not check.fresh:
-        logger.warning("the pruned model is not used: it is %s", check.describe())
+        logger.warning("the compact (pruned) model is not used: it is %s", check.describe())
     return check.fresh and model != "base"

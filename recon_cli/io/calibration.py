@@ -24,14 +24,14 @@ def viewmat_from_pose(value: Any, where: str, *, opengl: bool = False) -> NDArra
     `value` is 16 numbers row by row, [4, 4], or [3, 4] without its last row; `where` names it in
     messages. With `opengl` its camera looks along -z with y up, as in OpenGL and Blender. A
     rotation that is not orthonormal by rounding is replaced by the nearest one. FormatError if it
-    is no finite rigid matrix.
+    is not a finite rigid matrix.
     """
     pose = _matrix(value, where)
     rotation = pose[:3, :3]
     askew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if askew > ORTHONORMAL or np.linalg.det(rotation) < 0:
         raise FormatError(
-            f"{where} is no rigid pose: {_fault(rotation, askew)}. Needed is a rotation with a "
+            f"{where} is not a rigid pose: {_fault(rotation, askew)}. Needed is a rotation with a "
             "position, without scale or reflection.", hint=_HINT)
     left, _, right = np.linalg.svd(rotation)
     nearest = left @ right
@@ -63,7 +63,7 @@ def _matrix(value: Any, where: str) -> NDArray[np.float64]:
     try:
         pose = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{where} is no matrix of numbers.", hint=_HINT) from error
+        raise FormatError(f"{where} is not a matrix of numbers.", hint=_HINT) from error
     if pose.size == 12 and pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
     if pose.size != 16:
@@ -76,7 +76,7 @@ def _matrix(value: Any, where: str) -> NDArray[np.float64]:
             f"{where} puts the camera at {_numbers(pose[:3, 3])}, out of range.", hint=_HINT)
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHONORMAL:
         raise FormatError(
-            f"{where} is no rigid pose: its last row is {_numbers(pose[3])}, needed 0 0 0 1.",
+            f"{where} is not a rigid pose: its last row is {_numbers(pose[3])}, needed 0 0 0 1.",
             hint=_HINT)
     return pose
 
@@ -99,9 +99,9 @@ def lens_from_matrix(matrix: NDArray[np.float64], width: int, height: int, where
     In K the centre of the first pixel is at 0, here at 0.5. FormatError if K is skewed or invalid.
     """
     if matrix.shape[0] < 3 or matrix.shape[1] < 3 or not np.isfinite(matrix).all():
-        raise FormatError(f"{where} is no finite 3x3 or 4x4 matrix.")
+        raise FormatError(f"{where} is not a finite 3x3 or 4x4 matrix.")
     if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]) or abs(matrix[2, 2] - 1) > ORTHONORMAL:
-        raise FormatError(f"{where} is no matrix of intrinsics without skew.")
+        raise FormatError(f"{where} is not a matrix of intrinsics without skew.")
     params = (matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5)
     return make_lens("PINHOLE", width, height, params, where)
 

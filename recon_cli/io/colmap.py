@@ -229,7 +229,7 @@ def write_colmap(
     points: NDArray[np.float64],  # [P, 3]
     colors: NDArray[np.uint8],  # [P, 3]
 ) -> None:
-    """Writes a model of pinhole cameras into a new or empty folder, whole or not at all.
+    """Writes a model of pinhole cameras into a new or empty folder, atomically.
 
     Views are names below the folder of images, with their cameras; equal intrinsics share one. No
     observations are written. InputError if there are no views, or the folder holds something.
@@ -315,7 +315,7 @@ class Reader:
 
 
 def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
-    """Returns [4, 4] of a quaternion wxyz and a translation; None if they are no pose."""
+    """Returns [4, 4] of a quaternion wxyz and a translation; None if they are not a pose."""
     if not np.isfinite(pose).all() or not any(pose[:4]):
         return None
     quat = np.array(pose[:4])
@@ -328,4 +328,4 @@ def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
 
 def model_error(path: Path, fault: str, hint: str) -> FormatError:
     """Returns the error for a damaged file."""
-    return FormatError(f"{path} is not a whole COLMAP model: {fault}.", hint=hint)
+    return FormatError(f"{path} is not a complete COLMAP model: {fault}.", hint=hint)

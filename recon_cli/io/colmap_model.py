@@ -313,7 +313,7 @@ def _integers(words: Sequence[str], where: str, needed: int) -> list[int]:
     try:
         return [int(word) for word in words]
     except ValueError as error:
-        raise _line_error(where, "a word where a whole number belongs") from error
+        raise _line_error(where, "a word where an integer belongs") from error
 
 
 def _parse_sensor(words: Sequence[str], where: str) -> Sensor:

@@ -79,7 +79,7 @@ def decode_file(path: Path, flags: int) -> NDArray[np.uint8] | None:
 def fill_masked(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Returns an image [H, W, 3] whose ignored pixels have the mean colour of those that count.
 
-    SSIM compares windows: what is under the mask must not matter, and black would add an edge.
+    SSIM compares windows: pixels under the mask must not matter, and black would add an edge.
     """
     result = image.copy()
     result[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else 0
@@ -103,7 +103,7 @@ def to_uint8(image: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Writes [H, W, 3] RGB or [H, W] gray of 8 or 16 bits as PNG, whole or not at all."""
+    """Writes [H, W, 3] RGB or [H, W] gray of 8 or 16 bits as PNG, atomically."""
     ordered = image[:, :, ::-1] if image.ndim == 3 else image
     encoded, data = cv2.imencode(".png", np.ascontiguousarray(ordered))
     if not encoded:

@@ -36,7 +36,7 @@ class Mesh:
 
 
 def write_mesh(path: Path, mesh: Mesh, *, axes: NDArray[np.float64] | None = None) -> None:
-    """Writes a mesh in the format of the file's suffix, whole or not at all.
+    """Writes a mesh in the format of the file's suffix, atomically.
 
     `axes` [3, 3] are the axes of the file in those of the mesh, as in `glb.write_glb`.
     """
@@ -67,7 +67,7 @@ def _glb_bytes(
         primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
         tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] = True
         primitive["material"] = 0
-        tree["materials"] = [{  # without the extension it is no metal, as the default is
+        tree["materials"] = [{  # not metallic, as the default would be
             "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
             "extensions": {_UNLIT: {}}}]
         tree["extensionsUsed"] = [*tree.get("extensionsUsed", ()), _UNLIT]
@@ -80,7 +80,7 @@ def _glb_bytes(
 def write_point_cloud(
     path: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]
 ) -> None:
-    """Writes points [P, 3] with RGB colours [P, 3] as a .ply, whole or not at all."""
+    """Writes points [P, 3] with RGB colours [P, 3] as a .ply, atomically."""
     write_bytes(path, trimesh.PointCloud(points.astype(np.float32), colors).export(file_type="ply"))
 
 

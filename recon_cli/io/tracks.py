@@ -66,7 +66,7 @@ class Tracks:
         return rows[0][ours], rows[1][theirs]
 
     def write(self, path: Path) -> None:
-        """Writes the file, whole or not at all."""
+        """Writes the file atomically."""
         with atomic.replacing(path) as temporary:
             save_file({"image": self.image, "track": self.track, "xy": self.xy}, temporary,
                       metadata={"names": json.dumps(self.names)})

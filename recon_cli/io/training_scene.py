@@ -1,4 +1,4 @@
-"""The scene as sfm left it: its views and points, split by what each may be used for."""
+"""The scene as sfm left it: its views and points, split by their permitted use."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def held_out_names(ingest: Path) -> frozenset[str]:
 def load_scene(
     folders: Mapping[str, Path], *, validation: float | frozenset[str], sparse: Path | None = None
 ) -> Scene:
-    """Returns the views and points that sfm left, split by what each may be used for.
+    """Returns the views and points that sfm left, split by their permitted use.
 
     `folders` are those of ingest and sfm. `validation` are the names of views to look at only, or
     their share; `sparse` is the folder of a model with a part of the views and points.

@@ -1,8 +1,8 @@
 """Runs recon commands in processes of this machine, or has `ray_executor` do it.
 
-A command is what one would type. What it makes lies in a workspace whose stages commit atomically
-and resume: a retry is the same command, and nothing but an exit code has to come back. How far it
-is can be read in the workspace.
+A command is one that a user could type. Its results lie in a workspace whose stages commit
+atomically and resume: a retry is the same command, and only an exit code has to come back. Its
+progress can be read in the workspace.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Command:
 
     words: tuple[str, ...]  # after `recon`
     workspace: Path
-    log: Path  # gets what it prints; replaced by each call
+    log: Path  # for its output; replaced by each call
 
 
 class Executor(Protocol):
@@ -53,7 +53,7 @@ class Executor(Protocol):
         """
 
     def stop(self) -> None:
-        """Interrupts what runs: it saves its checkpoint, and `run` returns 130."""
+        """Interrupts the commands: each saves its checkpoint, and `run` returns 130."""
 
     def close(self) -> None:
         """Lets the machines go."""
@@ -82,7 +82,7 @@ class LocalExecutor:
                 self._running.discard(running)
 
     def stop(self) -> None:
-        """Interrupts what runs; see `Executor`."""
+        """Interrupts the commands; see `Executor`."""
         with self._lock:
             self._stopped = True
             for running in self._running:
@@ -110,7 +110,7 @@ class RunningCommand:
         return code if code > 0 else ExitCode.SIGNAL - code
 
     def interrupt(self) -> None:
-        """Has the command save what it has and end; `wait` returns 130."""
+        """Has the command save its work and end; `wait` returns 130."""
         self._stopped.set()
         process = self._process
         if process is not None:
@@ -146,13 +146,13 @@ def start_executor(
     place: str, folder: Path, *, inputs: Sequence[Path] = (), slots: int | None = None,
     cores: int | None = None, gpu: bool | None = None,
 ) -> tuple[Executor, int]:
-    """Returns what runs commands on `folder`, and how many threads each of them has.
+    """Returns the executor of commands on `folder`, and how many threads each command has.
 
     `place` is "local" or "ray". None: as many commands at once, and as many cores for each of them,
     as suit the machines; a GPU if they have one.
 
     Raises:
-        BackendError: there is no Ray cluster, or it lacks what a command needs.
+        BackendError: no Ray cluster was found, or it lacks resources for a command.
         WorkspaceError: a machine of it does not see `folder` or one of `inputs`.
     """
     if place == "ray":

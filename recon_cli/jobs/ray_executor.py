@@ -55,7 +55,7 @@ class RayExecutor:
         """Connects to a cluster and checks each machine; None: as many as suit the cluster.
 
         Raises:
-            BackendError: Ray is missing or runs this very command, there is no cluster, a machine
+            BackendError: Ray is missing or runs this very command, no cluster was found, a machine
                 lacks recon or has another version, or none has what a command needs.
             WorkspaceError: a machine does not see `folder` or one of `inputs`.
         """
@@ -116,7 +116,7 @@ class RayExecutor:
             hint="Start the cluster again and repeat the same command: finished work is kept.")
 
     def stop(self) -> None:
-        """Interrupts what runs; see `Executor`."""
+        """Interrupts the commands; see `Executor`."""
         with self._lock:
             self._stopped = True
             for reference in self._running:
@@ -179,7 +179,7 @@ def _run_command(words: list[str], workspace: str, log: str) -> int:
 
 
 def _probe(folder: str, name: str, token: str, inputs: list[str]) -> dict[str, Any]:
-    """Returns what a machine has and sees."""
+    """Returns the resources and files that a machine has."""
     path = Path(folder) / name
     try:
         sees = path.read_text(encoding="utf-8") == token

@@ -26,7 +26,7 @@ class SharedJob:
 
     name: str  # of its bar
     command: Command
-    look: Callable[[], tuple[float, str]]  # the share that is done, 0 to 1, and what it is at
+    look: Callable[[], tuple[float, str]]  # the share that is done, 0 to 1, and its activity
     weight: float = 1.0  # among all jobs
     # called right before it starts; a reason that it returns keeps the job from running
     prepare: Callable[[], str] = lambda: ""
@@ -54,7 +54,7 @@ def run_jobs(
     Raises:
         BackendError: the machines cannot be reached any more.
     """
-    shares, lock = [_look(job)[0] for job in jobs], threading.Lock()  # what was done before
+    shares, lock = [_look(job)[0] for job in jobs], threading.Lock()  # done before
     total = sum(job.weight for job in jobs)
 
     def look(index: int) -> tuple[int, str]:
@@ -93,10 +93,10 @@ def run_jobs(
     return [ends[index] for index in range(len(jobs))]
 
 
-def describe_failures(failed: Mapping[str, str], total: int, what: str) -> str:
+def describe_failures(failed: Mapping[str, str], total: int, noun: str) -> str:
     """Returns in a sentence how many of `total` failed and why; `failed` are reasons by name."""
     reasons = list_names([f"{name}: {reason.rstrip('.')}" for name, reason in failed.items()])
-    return f"{len(failed)} of {total} {what} failed ({reasons})."
+    return f"{len(failed)} of {total} {noun} failed ({reasons})."
 
 
 def _as_they_end(futures: Iterable[Future[JobEnd]]) -> Iterator[Future[JobEnd]]:
@@ -117,7 +117,7 @@ def _look(job: SharedJob) -> tuple[float, str]:
 
 @contextmanager
 def _watching(bar: Bar, look: Callable[[], tuple[int, str]]) -> Iterator[None]:
-    """Shows on a bar what `look` returns: percent that are done, and what is going on."""
+    """Shows on a bar the percentage done and the activity that `look` returns."""
     ended = threading.Event()
 
     def watch() -> None:

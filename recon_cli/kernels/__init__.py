@@ -1,1 +1,1 @@
-"""What kernels on the CPU share: how they are compiled, SIMD types, threads, and cameras."""
+"""Shared by kernels on the CPU: compilation, SIMD types, threads, and cameras."""

@@ -1,9 +1,9 @@
 """How every kernel is compiled, and where the machine code is kept.
 
 Compiling takes seconds, so the machine code is kept in the user's cache folder. numba stores it by
-pickle, which executes what the file says: the folder must belong to the user alone. Its name holds
+pickle, which executes code from the file: the folder must belong to the user alone. Its name holds
 a digest of the CPU, the versions and all sources of kernels/ and render/numba (numba checks only
-the file that a kernel stands in, not what it inlines), so that other code is never loaded. Where
+the file that a kernel stands in, not inlined functions), so that other code is never loaded. Where
 and when the sources were installed counts too: numba compiles again for another place or time.
 """
 
@@ -66,7 +66,7 @@ def inlined(function: Compiled) -> Compiled:
 
 @cache
 def cache_folder() -> Path | None:
-    """Returns the folder of the machine code; None where there is no place for it."""
+    """Returns the folder of the machine code; None if none can be written."""
     folder = machine.cache_root() / "kernels" / fingerprint()
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)

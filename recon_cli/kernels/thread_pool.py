@@ -1,8 +1,8 @@
 """Threads that run one kernel together, and the scratch memory that each of them owns.
 
-Kernels release the GIL and take blocks of work from a shared counter. There is no OpenMP, whose
-threads spin at every barrier and slow down whatever runs beside them. What a block computes does
-not depend on who takes it: any number of threads gives the same bits.
+Kernels release the GIL and take blocks of work from a shared counter. OpenMP is not used: its
+threads spin at every barrier and slow down other processes. The result of a block does not
+depend on who takes it: any number of threads gives the same bits.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _work(inbox: SimpleQueue[Callable[[], None]], wake: SimpleQueue[None]) -> No
 
 
 def _failure_of(call: Callable[[int], None], number: int) -> BaseException | None:
-    """Returns what a call raises, to be raised in the thread that waits."""
+    """Returns the exception of a call, to be raised in the thread that waits."""
     try:
         call(number)
     except BaseException as error:

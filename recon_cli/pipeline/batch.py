@@ -1,4 +1,4 @@
-"""Reconstructs many captures, each in a workspace of its own, and goes on after failures."""
+"""Reconstructs many captures, each in a workspace of its own, and continues after failures."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class Capture:
 
     @property
     def log(self) -> Path:
-        """What its command prints."""
+        """The output of its command."""
         return self.workspace.with_suffix(f"{self.workspace.suffix}.log")
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureResult(JsonRecord):
-    """How a capture ended; None for what it did not come to."""
+    """How a capture ended; None for steps that it did not reach."""
 
     capture: str
     source: str
@@ -108,7 +108,7 @@ def run_batch(
     Raises:
         ConfigError: a workspace holds another capture.
         BackendError: the machines cannot be reached any more.
-        KeyboardInterrupt: after the commands have saved what they have.
+        KeyboardInterrupt: after the commands have saved their work.
     """
     for capture in captures:
         _refuse_other_capture(capture)
@@ -142,7 +142,7 @@ def _refuse_other_capture(capture: Capture) -> None:
 
 
 def _look(workspace: Workspace) -> tuple[float, str]:
-    """Returns the share of a run that is done, and what it is at."""
+    """Returns the share of a run that is done, and its current activity."""
     before = 0
     for row in STAGES:
         after = _DONE_AFTER[row.name]
@@ -176,7 +176,7 @@ def _read_result(capture: Capture, code: int | None, reason: str) -> CaptureResu
 
 
 def _write(out: Path, results: Iterable[CaptureResult]) -> None:
-    """Writes batch.json, whole or not at all."""
+    """Writes batch.json atomically."""
     with disk_errors(out, "writing the results"):
         write_json(out / FILE, {
             "version": _VERSION, "captures": [result.to_json() for result in results]})

@@ -1,8 +1,8 @@
-"""Whether a training goes on from the finished scene in the workspace, or begins anew.
+"""Whether a training continues the finished scene in the workspace, or begins anew.
 
-It goes on from a finished run where more steps are asked for and nothing else that decides the
-result differs, and from an imported scene where that is asked for. What it goes on from is part of
-its key: the same options give other bytes from another start.
+It continues a finished run where more steps are asked for and nothing else that decides the
+result differs, and an imported scene where that is asked for. The continued scene is part of its
+key: the same options give other bytes from another start.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ logger = logging.getLogger("recon")
 
 
 class Start(Enum):
-    """What a run starts from."""
+    """The start of a run: anew, a finished run or an imported scene."""
 
     AUTO = "auto"  # a finished run that it prolongs, else nothing
     ANEW = "anew"  # nothing
@@ -58,7 +58,7 @@ def origin_row(row: Stage, key: ResultKey) -> Stage:
 
 
 def may_resume(workspace: Workspace, partial: PartialRun) -> bool:
-    """Returns whether what an interrupted run goes on from, if anything, is still in place."""
+    """Returns whether the result that an interrupted run continues, if any, is still in place."""
     if partial.key.continues is None:
         return True
     try:
@@ -69,10 +69,10 @@ def may_resume(workspace: Workspace, partial: PartialRun) -> bool:
 
 
 def find_start(workspace: Workspace, row: Stage, key: ResultKey, start: Start) -> str | None:
-    """Returns the digest of the finished result that a run goes on from; None: it begins anew.
+    """Returns the digest of the finished result that a run continues; None: it begins anew.
 
     Raises:
-        StageError: there is no imported scene to start from, or training anew would replace it.
+        StageError: no scene was imported to start from, or training anew would replace it.
     """
     if row.name != IMPORT.name or key.sources or start is Start.ANEW:
         return None
@@ -107,7 +107,7 @@ def find_start(workspace: Workspace, row: Stage, key: ResultKey, start: Start) -
 
 
 def _resumes(workspace: Workspace, partial: PartialRun, key: ResultKey) -> bool:
-    """Returns whether an interrupted run is the one of `key`, from whatever it started."""
+    """Returns whether an interrupted run is the one of `key`, with any start."""
     same = dataclasses.replace(key, continues=partial.key.continues)
     return may_resume(workspace, partial) and partial.key.fingerprint == same.fingerprint
 

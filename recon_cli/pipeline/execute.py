@@ -1,4 +1,4 @@
-"""Runs one stage: gives it a folder, a device and its inputs, and commits what it writes."""
+"""Runs one stage: gives it a folder, a device and its inputs, and commits its output."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ def run_stage(
 ) -> Manifest:
     """Runs a stage whose needs are fresh and returns its manifest; no `sources` are the last ones.
 
-    With `again` it does not go on from unfinished work.
+    With `again` it does not continue unfinished work.
 
     Raises:
-        ReconError: whatever the stage raises; what it had finished is kept for the next run.
+        ReconError: as the stage raises it; finished work is kept for the next run.
     """
     workspace = job.workspace
     if sources is None:
-        sources = _read_last_sources(job, row) if row.takes else ()
+        sources = _read_last_sources(job, row) if row.input_metavar else ()
     key = ResultKey(
         row.name, row.version, config.hashed_fields(), sources, checks.upstream(row),
         verb=row.verb)
@@ -96,9 +96,9 @@ def run_stage(
     with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
         run_it = import_module(row.module).run
-        with importing_ahead(job) as on_idle:
+        with importing_ahead(job) as while_idle:
             summary: JsonRecord = run_it(
-                config, inputs, out, dataclasses.replace(ctx, on_idle=on_idle))
+                config, inputs, out, dataclasses.replace(ctx, while_idle=while_idle))
     outputs = workspace.seal(row.name, without=summary.not_recorded())
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
@@ -115,7 +115,7 @@ def run_stage(
 def _find_earlier(
     workspace: Workspace, row: Stage, key: ResultKey, *, again: bool
 ) -> EarlierResult | None:
-    """Returns the result that a stage adds to, or goes on from as only late options differ.
+    """Returns the result that a stage adds to, or continues as only late options differ.
 
     What a result held that is added to is not known by a damaged manifest.
     """
@@ -146,7 +146,7 @@ def _without(key: ResultKey, options: Sequence[str]) -> str:
 
 @contextmanager
 def importing_ahead(job: Job) -> Iterator[Callable[[], None]]:
-    """Yields a function that imports, in a thread, what the stages need that render: seconds.
+    """Yields a function that imports, in a thread, the modules of rendering stages: seconds.
 
     Kernels that are compiled are loaded, too.
 
@@ -214,8 +214,8 @@ def _read_last_sources(job: Job, row: Stage) -> tuple[Source, ...]:
         raise ConfigError(
             f"{row.verb} needs an input: none was given, and {job.workspace.root} has no "
             "previous one.",
-            hint=f"Type `recon {row.verb} {row.takes}`"
-            f"{', or a folder of photos in place of VIDEO' * (row.takes == 'VIDEO')}.")
+            hint=f"Type `recon {row.verb} {row.input_metavar}`"
+            f"{', or a folder of photos in place of VIDEO' * (row.input_metavar == 'VIDEO')}.")
     return tuple(
         read_source(Path(source.path), known=source, without=job.workspace.root)
         for source in sources)
@@ -252,7 +252,7 @@ def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:
     """Returns where to train and render, once ready.
 
     Raises:
-        BackendError: what was asked for is not available.
+        BackendError: the requested backend or device is not available.
     """
     from recon_cli.render import registry  # imports torch
 

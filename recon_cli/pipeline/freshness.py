@@ -1,4 +1,4 @@
-"""Whether a result is still what a run would make now, and if not, why.
+"""Whether a run would make the same result now, and if not, why.
 
 A result is compared with the options it was made with, except where recon.toml, --config or --set
 say otherwise. After `recon train --iterations 100`, `recon eval` finds the training fresh although
@@ -34,7 +34,7 @@ from recon_cli.workspace.manifest import (
 
 @dataclass(frozen=True)
 class StageCheck:
-    """What is known of one stage's result."""
+    """The state of one stage's result."""
 
     row: Stage  # the stage
     manifest: Manifest | None  # of the finished result; None where there is none
@@ -87,10 +87,10 @@ class WorkspaceCheck:
     def row(self, name: str) -> Stage:
         """Returns the row of a stage, without the needs that an imported scene spares it."""
         row = self._rows[name]
-        if not row.spares or not self._imported:
+        if not row.optional_when_imported or not self._imported:
             return row
-        needs = tuple(need for need in row.needs if need not in row.spares)
-        return dataclasses.replace(row, needs=needs, uses=(*row.spares, *row.uses))
+        needs = tuple(need for need in row.needs if need not in row.optional_when_imported)
+        return dataclasses.replace(row, needs=needs, uses=(*row.optional_when_imported, *row.uses))
 
     @cached_property
     def _imported(self) -> bool:
@@ -139,11 +139,11 @@ class WorkspaceCheck:
         try:
             return layers.build(row.config, layers.merge(
                 [{layers.section_of(row.config): stored}, self._settings]))
-        except ConfigError:  # stored values that exclude each other or what is set now
+        except ConfigError:  # stored values that exclude each other or the present ones
             return layers.build(row.config, self._settings)
 
     def upstream(self, row: Stage) -> dict[str, str | None]:
-        """Returns the digests of what a stage reads; None for what is missing or left out."""
+        """Returns the digests of a stage's inputs; None for those that are missing or left out."""
         digests: dict[str, str | None] = {}
         for name in (*row.needs, *row.uses):
             check = self.check(name)
@@ -185,7 +185,7 @@ class WorkspaceCheck:
     ) -> ResultKey:
         """Returns the key that the result of a run would have now."""
         upstream = self.upstream(row)
-        for need in row.needs:  # what is missing now may well come out as it was
+        for need in row.needs:  # a missing result may well come out as it was
             upstream[need] = upstream[need] or stored.upstream.get(need)
         return ResultKey(
             row.name, row.version, config.hashed_fields(), sources, upstream, stored.continues,

@@ -56,18 +56,18 @@ class StageStatus:
 
     name: str  # of the stage and of its folder
     state: str  # fresh, stale, partial, missing or damaged
-    reasons: tuple[str, ...]  # why it is stale or what is damaged, in words
+    reasons: tuple[str, ...]  # why it is stale or damaged, in words
     done: int  # how much of an interrupted run would be resumed; 0 where there is none
-    total: int  # of how much; 0 where there is no interrupted run
+    total: int  # of how much; 0 without an interrupted run
     seconds: float | None  # that the finished result took; None where there is none
     summary: dict[str, Any]  # of the finished result
-    notices: tuple[str, ...]  # what the user should know but makes nothing stale
+    notices: tuple[str, ...]  # for the user; they make nothing stale
 
 
 def status(job: Job) -> tuple[StageStatus, ...]:
     """Returns how every stage stands. Takes no lock and changes nothing.
 
-    A stage whose manifest cannot be trusted is damaged; what needs it is stale.
+    A stage whose manifest cannot be trusted is damaged; stages that need it are stale.
 
     Raises:
         ConfigError: the settings hold a value that cannot be used.
@@ -92,7 +92,7 @@ def _status(check: StageCheck) -> StageStatus:
 def run(
     job: Job, verb: str, targets: Sequence[Target], *, again: bool = False
 ) -> tuple[Outcome, ...]:
-    """Brings every target up to date, in order, and returns what was done for each.
+    """Brings every target up to date, in order, and returns the outcome of each.
 
     Fresh targets run only with `again`, which also discards their unfinished work. `verb` is shown
     to processes that want the workspace.
@@ -101,7 +101,7 @@ def run(
         StageError: a need is not fresh and not automatic, or another verb's scene would be
             replaced.
         WorkspaceError: the workspace is in use, full, or not writable.
-        ReconError: whatever the stages raise.
+        ReconError: as the stages raise it.
     """
     outcomes = []
     root, stages = job.workspace.root, [target.stage for target in targets]
@@ -122,7 +122,7 @@ def run(
 
 
 def _raise_failure(job: Job, outcome: Outcome) -> None:
-    """Raises what a stage that has run did not achieve, though its result is worth keeping."""
+    """Raises the failure of a stage that has run, though its result is worth keeping."""
     if not outcome.ran:
         return
     row = next(row for row in job.table if row.name == outcome.stage)
@@ -189,11 +189,11 @@ def require_fresh(job: Job, stages: Sequence[str]) -> None:
 
 
 def command(checks: WorkspaceCheck, check: StageCheck) -> str:
-    """Returns what to type to bring a stage up to date with the options it had."""
+    """Returns the command that brings a stage up to date with the options it had."""
     words = ["recon", check.row.verb]
     latest = check.partial_run or check.manifest
     if latest is None:
-        return " ".join([*words, check.row.takes] if check.row.takes else words)
+        return " ".join([*words, check.row.input_metavar] if check.row.input_metavar else words)
     config, default = checks.config(check.row, latest.key), checks.config(check.row, None)
     for item in dataclasses.fields(check.row.config):
         value, info = getattr(config, item.name), option_info(item)
@@ -213,7 +213,7 @@ def _option_words(name: str, value: Any, info: OptionInfo) -> list[str]:
 
 
 def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outcome]:
-    """Runs what a target needs and then the target, and yields every stage that is done."""
+    """Runs the needs of a target and then the target, and yields every stage that is done."""
     checks = job.inspect()
     row = checks.row(target.stage)
     sources = _read_sources(job, target)
@@ -223,7 +223,7 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         yield from _run_if_needed(job, step)
     if steps:
         checks = job.inspect()
-        plan(checks, row.name)  # what was fresh may have become stale by what has just run
+        plan(checks, row.name)  # a fresh stage may have become stale by the last one
         fresh = None if again else _find_fresh(job, checks, target, sources)
     if fresh is None:
         start = Start.ANEW if again and target.start is Start.AUTO else target.start
@@ -271,15 +271,15 @@ def _find_fresh(
 
 
 class _LogFile(logging.FileHandler):
-    """The log in the workspace, whose loss for want of space is no reason to fail, or to print."""
+    """The log in the workspace: where the disk is full, lines are lost without a message."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  # logging's name
-        """Leaves a failure to write to what has to be written."""
+        """Ignores a failure to write: files that matter report their own."""
         if not isinstance(sys.exception(), OSError):
             super().handleError(record)
 
     def close(self) -> None:
-        """Closes the file; what is still to be written may not fit."""
+        """Closes the file; the rest of the buffer may not fit."""
         with suppress(OSError):
             super().close()
 
@@ -298,7 +298,7 @@ def _log_to(path: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        # To the file alone: what the user sees of it is up to the caller.
+        # To the file alone: the caller decides on the terminal.
         handler.handle(logger.makeRecord(
             logger.name, logging.ERROR, __file__, 0, "failed", (), sys.exc_info()))
         raise
@@ -313,11 +313,11 @@ class Freed:
 
     path: Path
     size: int
-    is_link: bool  # which alone is removed, not what it points to
+    is_link: bool  # which alone is removed, not its target
 
 
 def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:
-    """Removes what can be spared and returns it; with `dry` nothing is removed.
+    """Removes dispensable files and returns them; with `dry` nothing is removed.
 
     That is unfinished work, replaced results and large volatile files, or the results of `stages`.
     Nothing is removed through a link.

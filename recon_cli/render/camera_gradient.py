@@ -35,7 +35,7 @@ def camera_gradient(
     torque(sh) = - d x d/dd sum_k p_k Y_k(d), with p_k = sum over channels of sh_rest_k dL/dcolour,
     and dL/dcolour = dL/dsh_dc / SH_C0.
 
-    Sums over Gaussians are taken in float64 and in a fixed order, whatever the number of threads.
+    Sums over Gaussians are taken in float64 and in a fixed order, for any number of threads.
 
     `gradients` are those of `splats` as rendered with `camera`; sh_rest is not read.
     """

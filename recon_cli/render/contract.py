@@ -20,7 +20,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
 TILE = 16  # pixels; the tile of the paper and of INRIA's rasterizer
-ALPHA_MIN = 1.0 / 255.0  # a fragment below one 8-bit step is no fragment
+ALPHA_MIN = 1.0 / 255.0  # a fragment below one 8-bit step is ignored
 ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) bounded in the backward pass
 # A pixel stops before it would fall below this: 1e-4 less a margin for rounding, so that two
 # fragments of alpha .99, which leave 1e-4, are both drawn whatever the precision.
@@ -47,7 +47,7 @@ _ALIGNED = 64  # numbers: kernels are compiled anew for addresses that are align
 
 @dataclass(eq=False)
 class Statistics:
-    """What densification and pruning need, gathered by the same passes that render.
+    """Statistics for densification and pruning, gathered by the same passes that render.
 
     Pixels that a mask ignores are drawn, but do not count in hits, blend_sum, blend_max and loo.
     The gradients, variance and loo are zeros until backward() has run.
@@ -93,7 +93,7 @@ class RenderOutput:
 
 @dataclass(frozen=True, eq=False)
 class TargetImage:
-    """What a training step compares a rendered view with."""
+    """The image that a training step compares a rendered view with."""
 
     pixels: NDArray[np.uint8]  # [H, W, 3]
     mask: NDArray[np.bool_] | None = None  # [H, W] True where a pixel counts; None: everywhere
@@ -102,7 +102,7 @@ class TargetImage:
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What a training step without autograd computes."""
+    """The outputs of a training step without autograd."""
 
     sh_degree: int  # highest in use, as in `recon_cli.render.registry.render`
     ssim_weight: float  # w in [0, 1] of the loss (1 - w) L1 + w (1 - SSIM)

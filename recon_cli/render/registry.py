@@ -69,11 +69,11 @@ def cuda_verdict() -> Verdict | None:
 
 
 def resolve(backend: str, device: str) -> tuple[str, str]:
-    """Returns (backend, device) with every `auto` replaced by what will run.
+    """Returns (backend, device) with every `auto` replaced by the actual choice.
 
     On CUDA `auto` takes triton only where its kernels passed the self-check on this GPU. A backend
     that was named runs even where it failed, with a warning: it may be the check that is wrong.
-    BackendError if what was named cannot run; nothing else is used instead.
+    BackendError if the named one cannot run; nothing else is used instead.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendError(
@@ -86,7 +86,7 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
         return _fastest(known.values(), device), device
     if backend not in known:
         raise BackendError(
-            f"There is no backend {backend!r}.", hint="Known are " + ", ".join(known) + ".")
+            f"Unknown backend {backend!r}.", hint="Known are " + ", ".join(known) + ".")
     status = known[backend]
     if device not in status.devices or status.missing:
         reason = status.missing or f"it does not run on {device}"
@@ -170,7 +170,7 @@ def renderer(backend: str) -> Renderer:
         from recon_cli.render.triton.backend import render as triton_render
 
         return triton_render
-    raise BackendError(f"There is no backend {backend!r}.", hint="See `recon doctor`.")
+    raise BackendError(f"Unknown backend {backend!r}.", hint="See `recon doctor`.")
 
 
 def render(
@@ -189,7 +189,7 @@ def render(
         splats: N Gaussians; gradients flow to every raw parameter that requires them.
         camera: a pinhole camera, OpenCV axes, pixel centres at +0.5.
         background: colour behind everything.
-        sh_degree: highest degree in use, 0 to 3; what the splats do not have counts as zero.
+        sh_degree: highest degree in use, 0 to 3; coefficients that the splats lack count as zero.
         backend: a name from `available_backends`.
         scores: also gather hits, blend_sum and blend_max, and loo in the backward pass.
         mask: bool, the pixels that the scores are taken over, None for all; it changes neither the
@@ -197,7 +197,7 @@ def render(
 
     Raises:
         ValueError: a shape, dtype or device does not fit.
-        BackendError: there is no such backend here.
+        BackendError: the backend is unknown or not available here.
     """
     check_inputs(splats, camera, background, sh_degree, mask)
     return renderer(backend)(splats, camera, background, sh_degree, scores, mask)
@@ -220,7 +220,7 @@ def find_crossing(
 
     Raises:
         ValueError: a shape, dtype or device does not fit, or the level is none.
-        BackendError: there is no such backend here.
+        BackendError: the backend is unknown or not available here.
     """
     check_inputs(splats, camera, splats.means.new_zeros(3), 0, None)
     if not TRANSMITTANCE_MIN < level < 1:

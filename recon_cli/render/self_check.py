@@ -55,8 +55,8 @@ class Verdict:
 
     backend: str
     device: str  # name of the GPU, or "cpu"
-    failure: str  # what differed and by how much, or what was raised; empty where all is well
-    errors: dict[str, float]  # every comparison, as a multiple of what is allowed
+    failure: str  # the difference, or the exception; empty where all is well
+    errors: dict[str, float]  # every comparison, as a multiple of the allowed difference
     seconds: float  # that the check took
 
     @property
@@ -75,7 +75,7 @@ class StepResult:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class BackendCandidate:
     """A backend that is to be checked."""
 
     name: str
@@ -84,7 +84,7 @@ class Candidate:
     train_step: Callable[[Splats, Camera, TargetImage, StepOptions], StepResult]
 
 
-def numba_candidate() -> Candidate:
+def numba_candidate() -> BackendCandidate:
     """Returns the numba backend."""
     from recon_cli.render.numba.backend import render
     from recon_cli.render.numba.optimizer import step as adam
@@ -98,10 +98,10 @@ def numba_candidate() -> Candidate:
         adam(*_adam_groups(moved, gradients), count=1, betas=_BETAS, epsilon=_EPSILON)
         return StepResult(loss, gradients, moved)
 
-    return Candidate("numba", render, train_step)
+    return BackendCandidate("numba", render, train_step)
 
 
-def triton_candidate() -> Candidate:
+def triton_candidate() -> BackendCandidate:
     """Returns the triton backend."""
     from recon_cli.render.triton.backend import render
     from recon_cli.render.triton.optimizer import step as adam
@@ -120,7 +120,7 @@ def triton_candidate() -> Candidate:
              taken=torch.zeros(1, dtype=torch.int64, device=splats.means.device), epsilon=_EPSILON)
         return StepResult(report.loss, gradients, moved)
 
-    return Candidate("triton", render, train_step)
+    return BackendCandidate("triton", render, train_step)
 
 
 CANDIDATES = {"numba": numba_candidate, "triton": triton_candidate}
@@ -135,7 +135,7 @@ def _adam_groups(moved: Splats, gradients: Splats) -> _AdamGroups:
 
 
 def check(
-    candidate: Candidate, device: torch.device, *, count: int = 300, width: int = 80,
+    candidate: BackendCandidate, device: torch.device, *, count: int = 300, width: int = 80,
     height: int = 60,
 ) -> Verdict:
     """Compares a backend with the torch backend in float64 and returns the verdict.
@@ -151,7 +151,7 @@ def check(
             for quantity, error in _compare(candidate, splats, camera):
                 errors[f"{quantity}, {label} scene"] = (
                     error if math.isfinite(error) else _NOT_FINITE)
-        wrong = [f"{quantity}: error {error:.3g} times what is allowed"
+        wrong = [f"{quantity}: error {error:.3g} times the allowed difference"
                  for quantity, error in errors.items() if error > 1]
         failure = "; ".join(wrong[:3]) + (f"; {len(wrong) - 3} more" if len(wrong) > 3 else "")
     except Exception as error:  # compilers and drivers raise many types
@@ -186,8 +186,10 @@ def _random_splats(count: int, seed: int) -> Splats:
     return Splats(*(torch.from_numpy(value.astype(np.float32)) for value in values))
 
 
-def _compare(candidate: Candidate, splats: Splats, camera: Camera) -> Iterator[tuple[str, float]]:
-    """Yields each comparison with its error as a multiple of what is allowed."""
+def _compare(
+    candidate: BackendCandidate, splats: Splats, camera: Camera
+) -> Iterator[tuple[str, float]]:
+    """Yields each comparison with its error as a multiple of the allowed one."""
     ours, again = (_render_backward(candidate.render, splats, camera) for _ in range(2))
     truth = _render_backward(torch_render, splats.map(torch.Tensor.double), camera)
     for name, value in truth.items():
@@ -206,7 +208,7 @@ def _compare(candidate: Candidate, splats: Splats, camera: Camera) -> Iterator[t
 
 
 def _compare_steps(
-    candidate: Candidate, splats: Splats, camera: Camera
+    candidate: BackendCandidate, splats: Splats, camera: Camera
 ) -> Iterator[tuple[str, float]]:
     """Yields the comparisons of plain training steps of each degree, and of one with all else.
 

@@ -13,6 +13,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
 from recon_cli.evaluation.scores import Metrics
 from recon_cli.pipeline.execute import Job, last_sources
@@ -30,7 +31,7 @@ from recon_cli.report.gallery import (
 )
 from recon_cli.report.headline import build_headline, format_facts
 from recon_cli.report.parts import read_parts
-from recon_cli.report.records import LABELS, build_scores, read_metrics
+from recon_cli.report.records import build_scores, read_metrics
 from recon_cli.report.room import read_room
 from recon_cli.report.stage_status import (
     StageReports,
@@ -53,8 +54,8 @@ def write_report(job: Job, out: Path | None) -> str:
     """Writes the report of a workspace, which is only read, and returns its path and size.
 
     `out` is report.html in the workspace by default. StageError if ingest has not run yet,
-    ManifestError if its manifest cannot be trusted; ConfigError if `out` is no HTML file, or would
-    change a result or an input; WorkspaceError if it cannot be written.
+ManifestError if its manifest cannot be trusted; ConfigError if `out` is not an HTML file, or
+    would change a result or an input; WorkspaceError if it cannot be written.
     """
     path = (job.workspace.root / FILE if out is None else out).absolute()
     _check_path(job, path)
@@ -113,7 +114,7 @@ def build_report(job: Job) -> bytes:
 def _template_values(
     job: Job, stages: StageReports, metrics: Metrics | None, damaged: str
 ) -> dict[str, Any]:
-    """Returns what the template shows, except for the views."""
+    """Returns the template's values, except for the views."""
     root = job.workspace.root
     runs = [stage.manifest.run for stage in stages.values() if stage.manifest]
     return {
@@ -128,7 +129,7 @@ def _template_values(
         "sweep": draw_prune_curve(root, stages), "rounds": draw_rounds(stages["prune"]),
         "sweep_command": f"recon prune --sweep -w {shlex.quote(str(root))}",
         "part_command": f"recon sfm -w {shlex.quote(str(root))} --part",
-        "provenance": read_provenance(stages), "labels": LABELS,
+        "provenance": read_provenance(stages), "labels": MODEL_LABELS,
         "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),
         "longest": max(run.seconds for run in runs),
         "largest": max(run.peak_memory_bytes for run in runs),

@@ -50,13 +50,13 @@ MISSING = {"other part": (4, "triangle"), "left out": (1, "plus"), "lost": (3, "
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureSection:
     """The section on the capture; pictures are data URIs."""
 
     sheets: tuple[Markup, ...]  # contact sheets
     more_sheets: int  # contact sheets that are left out
-    overlays: tuple[Markup, ...]  # frames with what is fixed to the camera in red
-    thumbs: tuple[tuple[str, Markup], ...]  # (name, picture) of frames if there is no sheet
+    overlays: tuple[Markup, ...]  # frames with overlays in red
+    thumbs: tuple[tuple[str, Markup], ...]  # (name, picture) of frames, without a contact sheet
     plan: Markup | None  # None without a mapping to draw
     notes: tuple[str, ...]  # on the plan
     strip: Markup | None  # all frames in order
@@ -65,7 +65,7 @@ class Capture:
     damaged: tuple[str, ...]  # why something is not shown
 
 
-def read_capture(stages: StageReports) -> Capture:
+def read_capture(stages: StageReports) -> CaptureSection:
     """Returns the capture of a workspace, as far as its files can be read."""
     ingest = stages["ingest"]
     damaged: list[str] = []
@@ -87,7 +87,7 @@ def read_capture(stages: StageReports) -> Capture:
         overlays = [data_uri(fit_image(read_png(path), WIDTH), _THUMB_QUALITY)
                     for path in sorted(ingest.folder.glob("*overlay.png"))[:_SHEETS]]
     except (FormatError, OSError) as error:
-        damaged.append(f"What is masked is not shown: {error}")
+        damaged.append(f"Masked areas are not shown: {error}")
     scene = None
     if stages["sfm"].there and frames:
         try:
@@ -104,7 +104,7 @@ def read_capture(stages: StageReports) -> Capture:
         **{name: "other part" for part in (sfm.parts if sfm else ()) for name in part.names},
         **dict.fromkeys(left_out, "left out")}
     parts = [by_name.get(frame.name, missing.get(frame.name, "lost")) for frame in frames]
-    return Capture(
+    return CaptureSection(
         tuple(sheets), more, tuple(overlays), tuple(thumbs), plan, notes,
         _draw_strip(frames, parts) if frames else None, _describe_left_out(frames, left_out),
         _draw_legend(parts) if frames else None, tuple(damaged))
@@ -138,7 +138,7 @@ def _draw_plan(
     if not axes.known:
         notes.append("Up is not known: the view is along the mean up of the cameras.")
     if not metres:
-        notes.append("The scale is arbitrary, so there is no scale bar; "
+        notes.append("The scale is arbitrary, so the plan has no scale bar;  "
                      "recon sfm --scale-between A B METRES sets it.")
     if regions:
         notes.append("Numbers are poorly seen regions, as listed under Trust.")

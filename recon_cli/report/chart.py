@@ -118,7 +118,7 @@ def draw_mark(shape: str, x: float, y: float, r: float, color: int, title: str =
 
 
 def legend_item(label: str, drawing: Markup) -> Markup:
-    """Returns an entry of a legend: a drawing and what it stands for."""
+    """Returns an entry of a legend: a drawing and its meaning."""
     return Markup('<li><svg viewBox="0 0 26 14" aria-hidden="true">{}</svg>{}</li>').format(
         drawing, label)
 

@@ -83,7 +83,8 @@ def draw_training_curves(stages: StageReports, metrics: Metrics | None) -> Train
 
 def _mark_held_out(metrics: Metrics | None, evaluate: StageReport) -> list[Series]:
     """Returns one mark for each model: its training seconds and held-out PSNR."""
-    styles = {BASE: ("held out, base", 0, "diamond"), PRUNED: ("held out, pruned", 1, "triangle")}
+    styles = {BASE: ("held out, original", 0, "diamond"),
+              PRUNED: ("held out, compact", 1, "triangle")}
     return [Series(label + evaluate.stale_suffix, ((model.train_seconds, model.psnr_db),), color,
                    mark, line=False, big=True)
             for key, (label, color, mark) in styles.items()
@@ -127,8 +128,8 @@ def draw_prune_curve(root: Path, stages: StageReports) -> PruneCurve:
         f"PSNR on {sweep.validation_views} validation views after {sweep.recovery_steps} steps of "
         "recovery", _LEFT, _DECIBELS, [
             *_sweep_series(sweep),
-            *_mark_model(stages["train"], TrainSummary, "base model", 0, "diamond"),
-            *_mark_model(stages["prune"], PruneSummary, "pruned model", 1, "triangle"),
+            *_mark_model(stages["train"], TrainSummary, "original model", 0, "diamond"),
+            *_mark_model(stages["prune"], PruneSummary, "compact model", 1, "triangle"),
             Series("no prune, as many steps", controls, 7, "bar", line=False, big=True)],
         above=("megabytes of the .ply", megabytes) if megabytes else None)
     return PruneCurve(figure, _why_stale(path, sweep, stages["train"]))

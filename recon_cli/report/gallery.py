@@ -84,7 +84,7 @@ class Gallery:
 
 @dataclass(frozen=True, eq=False)
 class _ViewPixels:
-    """What evaluate wrote of one view."""
+    """The files of evaluate on one view."""
 
     truth: NDArray[np.uint8]  # [H, W, 3] RGB
     renders: Mapping[str, NDArray[np.uint8]]  # by model

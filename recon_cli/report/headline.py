@@ -113,7 +113,7 @@ def _build_tiles(stages: StageReports, metrics: Metrics | None) -> Iterator[Tile
         share += f", {len(cameras.left_out):,} left out"
     yield _stage_tile(
         sfm, "registered", f"{cameras.registered:,}" if cameras else _LACKING, share)
-    pruned = f"pruned {_count(prune, PruneSummary)}" if prune.there else ""
+    pruned = f"compact {_count(prune, PruneSummary)}" if prune.there else ""
     if pruned and train.fresh:  # if training is stale too, its tile says so already
         pruned += prune.stale_suffix
     yield _stage_tile(train, "Gaussians", _count(train, TrainSummary), pruned)
@@ -143,9 +143,9 @@ def _score_tiles(evaluate: StageReport, metrics: Metrics | None) -> Iterator[Til
     first = next(iter(metrics.models.values()))
     pruned = metrics.models.get(PRUNED) if BASE in metrics.models else None
     yield Tile("held-out PSNR", f"{first.psnr_db:.2f} dB",
-               f"pruned {pruned.psnr_db:.2f} dB" if pruned else "", not evaluate.fresh)
+               f"compact {pruned.psnr_db:.2f} dB" if pruned else "", not evaluate.fresh)
     yield Tile("held-out SSIM", f"{first.ssim:.4f}",
-               f"pruned {pruned.ssim:.4f}" if pruned else "", not evaluate.fresh)
+               f"compact {pruned.ssim:.4f}" if pruned else "", not evaluate.fresh)
 
 
 def format_facts(summary: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

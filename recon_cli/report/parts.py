@@ -1,4 +1,4 @@
-"""A capture in several parts: what each holds, and what to film to join them.
+"""A capture in several parts: the frames of each, and where to film to join them.
 
 Parts are joined by a film that shows the way from one to the other, so the page shows the moments
 between them: the last frame of one and the first of the next. As many moments are shown as are
@@ -112,7 +112,7 @@ def number_frames(frames: Sequence[Frame], parts: Sequence[PartSummary]) -> list
 
 @dataclass(frozen=True)
 class Gap:
-    """What lies between two parts in the order of the frames."""
+    """The gap between two parts in the order of the frames."""
 
     numbers: tuple[int, int]
     before: Frame
@@ -154,16 +154,16 @@ def _read_moment(ingest: Path, gap: Gap) -> Moment:
 
 
 def advise(gap: Gap) -> str:
-    """Returns in a sentence what to film to join two parts."""
+    """Returns a sentence on where to film to join two parts."""
     first, second = _format_time(gap.before), _format_time(gap.after)
     if not first or not second:
         return (f"Take ten or more photos on the way from where {gap.before.name} was taken to "
-                f"where {gap.after.name} was taken; each shows half of what the one before shows.")
+                f"where {gap.after.name} was taken; each overlaps the one before by half.")
     if gap.before.source != gap.after.source:
         where = f"the way from {gap.before.source} at {first} to {gap.after.source} at {second}"
     else:
         start, end = _format_time(gap.before, -MARGIN), _format_time(gap.after, MARGIN)
-        where = f"what the film shows from {start} to {end}"
+        where = f"the places of the film from {start} to {end}"
     return (f"Film {where} again: walk slowly from where the left picture was taken to where the "
             "right one was taken, sideways rather than turning on the spot, and keep half of the "
             "view in the picture from one second to the next.")

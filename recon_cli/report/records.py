@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval
 from recon_cli.evaluation.scores import Metrics, ModelMetrics, Sweep, Table, or_dash
@@ -20,7 +21,6 @@ from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.summaries import LogRow
 
 BASE, PRUNED = MODELS = ("base", "pruned")
-LABELS = {BASE: "base", PRUNED: "pruned"}
 _TITLES = {"psnr": "PSNR", "psnr_8bit": "8-bit", "ssim": "SSIM", "ssim_padded": "SSIM 0-pad",
            "lpips": "LPIPS", "mask": "masks"}
 
@@ -53,7 +53,7 @@ def _format_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         raise FormatError(f"{path.name} cannot be read: {error.strerror}.") from error
     except (ManifestError, ValueError) as error:
-        raise FormatError(f"{path.name} does not hold what recon writes.") from error
+        raise FormatError(f"{path.name} was not written by recon, or is damaged.") from error
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def _model_table(models: Mapping[str, ModelMetrics]) -> Table:
         ("model", "PSNR, dB", "8-bit, dB", *["PSNR after gains, dB"] * gains, "SSIM", "SSIM 0-pad",
          *["LPIPS"] * perceptual, "Gaussians", "size", "ms a view", "training, s"),
         tuple((
-            LABELS[key], f"{model.psnr_db:.2f}", f"{model.psnr_8bit_db:.2f}",
+            MODEL_LABELS[key], f"{model.psnr_db:.2f}", f"{model.psnr_8bit_db:.2f}",
             *[or_dash(model.gain_psnr_db, ".2f")] * gains, f"{model.ssim:.4f}",
             f"{model.ssim_padded:.4f}", *[or_dash(model.lpips, ".4f")] * perceptual,
             f"{model.gaussians:,}", format_megabytes(model.bytes), f"{model.render_ms:.0f}",
@@ -107,7 +107,7 @@ def _gap_table(models: Mapping[str, ModelMetrics]) -> Table:
         held_out = model.psnr_db if model.gain_psnr_db is None else model.gain_psnr_db
         training, validation = map(model.seen_psnr_db.get, ("training", "validation"))
         gap = None if training is None else training - held_out
-        rows.append((LABELS[key], or_dash(training, ".2f"), or_dash(validation, ".2f"),
+        rows.append((MODEL_LABELS[key], or_dash(training, ".2f"), or_dash(validation, ".2f"),
                      f"{held_out:.2f}", or_dash(gap, "+.2f")))
     return Table(("model", "training, dB", "validation, dB", "held out, dB",
                   "training minus held out, dB"), rows)
@@ -133,5 +133,5 @@ def _view_table(models: Mapping[str, ModelMetrics]) -> Table:
         scores = [views.get(view.name) for views in by_name]
         rows.append((view.name, *(or_dash(row.psnr_db if row else None, ".2f") for row in scores),
                      *(or_dash(row.ssim if row else None, ".4f") for row in scores)))
-    return Table(("view", *(f"PSNR {LABELS[key]}, dB" for key in models),
-                  *(f"SSIM {LABELS[key]}" for key in models)), rows)
+    return Table(("view", *(f"PSNR {MODEL_LABELS[key]}, dB" for key in models),
+                  *(f"SSIM {MODEL_LABELS[key]}" for key in models)), rows)

@@ -18,10 +18,10 @@ _MOST_BYTES = 3_000_000  # of a plan; the page has a limit of its own
 
 @dataclass(frozen=True)
 class Room:
-    """What the page shows."""
+    """The section on the room."""
 
     figures: tuple[tuple[str, str], ...]  # (label, value with its interval)
-    notes: tuple[str, ...]  # what was not found
+    notes: tuple[str, ...]  # on measures that are missing
     plan: Markup | None  # data URI, in which nothing needs escaping; None if it cannot be shown
 
 

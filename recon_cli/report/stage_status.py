@@ -60,7 +60,7 @@ class StageReport:
 
     @property
     def stale_suffix(self) -> str:
-        """What a label of its figures ends with: nothing where they are fresh."""
+        """The suffix of its figures' labels: empty where they are fresh."""
         return "" if self.fresh else " (stale)"
 
 
@@ -145,7 +145,7 @@ def read_provenance(stages: StageReports) -> Provenance:
 
 
 def read_decisions(train: StageReport) -> tuple[TrialDecision, ...]:
-    """Returns what training decided about each optional part; empty if unreadable."""
+    """Returns training's decision on each optional part; empty if unreadable."""
     try:
         return TrainPlan.read(train.folder).needs if train.there else ()
     except (FormatError, ManifestError):
@@ -161,7 +161,7 @@ def _read_settings(stage: StageReport) -> StageSettings:
             value = read_json(stage.folder / "config.json")
             chosen = value if isinstance(value, dict) else {}
         except FormatError as error:
-            damaged = f"What training decided by itself is not shown: {error.message}"
+            damaged = f"The decisions of training are not shown: {error.message}"
     rows = tuple((
         name, _format_option(value),
         _format_option(chosen[name]) if name in chosen and chosen[name] != value else "")

@@ -25,7 +25,7 @@ _PICTURES, _SIDE, _QUALITY = 6, 480, 72
 
 @dataclass(frozen=True)
 class TrustSection:
-    """What the page says about trust."""
+    """The section on trust."""
 
     missing: str  # why there is nothing, as a sentence; empty where there is
     headline: str = ""  # share of the surface that is well seen
@@ -39,7 +39,7 @@ class TrustSection:
 
 
 def read_record(stages: StageReports) -> TrustRecord | None:
-    """Returns what evaluate left about trust; None without it. FormatError if it is damaged."""
+    """Returns evaluate's record on trust; None without it. FormatError if it is damaged."""
     stage = stages["evaluate"]
     if not stage.there:
         return None
@@ -69,7 +69,7 @@ def read_trust(stages: StageReports) -> TrustSection:
             "Trust was not measured." if stages["evaluate"].there else "Trust needs evaluate.")
     if record.reason:
         return TrustSection(record.reason)
-    models = {name: trust for name in MODELS if (trust := record.of(name)) is not None}
+    models = {name: trust for name in MODELS if (trust := record.model_trust(name)) is not None}
     first = next(iter(models.values()))
     return TrustSection(
         "", f"{first.surface.well:.0%} of the surface that the views show is well seen: by "

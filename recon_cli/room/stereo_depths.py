@@ -15,7 +15,7 @@ from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.gravity import find_gravity
-from recon_cli.stereo.depths import Levels, Photo, find_depths, find_partners, places
+from recon_cli.stereo.depths import Levels, StereoView, find_depths, find_partners, places
 
 _SIDE = 600  # pixels of the longer side at most
 _MOST_VIEWS = 150  # that get a depth map, evenly spread; about 2 CPU seconds each
@@ -69,7 +69,7 @@ def with_stereo(
         [*weights, *added.gains], maps.median)
 
 
-def _photos(maps: DepthMaps) -> list[Photo]:
+def _photos(maps: DepthMaps) -> list[StereoView]:
     """Returns the views at 600 pixels at most, to be searched about the depths of `maps`."""
     photos = []
     for view, depth in zip(maps.views, maps.depths, strict=True):
@@ -78,7 +78,8 @@ def _photos(maps: DepthMaps) -> list[Photo]:
             some = np.concatenate([other[::8, ::8][other[::8, ::8] > 0] for other in maps.depths])
         near, far = np.quantile(some, [_TAIL, 1 - _TAIL])
         longest = max(view.camera.width, view.camera.height)
-        photos.append(Photo(reduce_view(view, max(1.0, longest / _SIDE)), float(near), float(far)))
+        photos.append(
+            StereoView(reduce_view(view, max(1.0, longest / _SIDE)), float(near), float(far)))
     return photos
 
 

@@ -1,1 +1,1 @@
-"""What a reconstruction is made of: cameras, views, Gaussians. Knows no files, no training."""
+"""The elements of a reconstruction: cameras, views, Gaussians; no files, no training."""

@@ -37,7 +37,7 @@ class Backdrop:
     reach: float  # within which of it they are, world units
 
     @staticmethod
-    def of(numbers: Sequence[float]) -> Backdrop:
+    def from_numbers(numbers: Sequence[float]) -> Backdrop:
         """Returns the backdrop of the seven numbers in order.
 
         Raises:
@@ -53,7 +53,7 @@ class Backdrop:
         """Returns a grey one, 0 to 1, for cameras [C, 3]."""
         middle = cameras.mean(axis=0)
         reach = np.linalg.norm(cameras - middle, axis=1).max()
-        return Backdrop.of([grey, grey, grey, *middle.tolist(), float(reach)])
+        return Backdrop.from_numbers([grey, grey, grey, *middle.tolist(), float(reach)])
 
     @property
     def color(self) -> tuple[float, float, float]:
@@ -68,7 +68,7 @@ class Backdrop:
     def moved(self, similarity: Similarity) -> Backdrop:
         """Returns the same in another world."""
         middle = similarity.points(np.array([self.x, self.y, self.z]))
-        return Backdrop.of(
+        return Backdrop.from_numbers(
             [*self.color, *middle.tolist(), float(similarity.scale * self.reach)])
 
     def sphere(
@@ -98,7 +98,7 @@ def enclosing(parts: Sequence[Backdrop | None]) -> Backdrop | None:
     middles = np.array([[part.x, part.y, part.z] for part in known])
     middle = middles.mean(axis=0)
     reach = np.linalg.norm(middles - middle, axis=1) + [part.reach for part in known]
-    return Backdrop.of([*known[0].color, *middle.tolist(), float(reach.max())])
+    return Backdrop.from_numbers([*known[0].color, *middle.tolist(), float(reach.max())])
 
 
 def fibonacci_sphere(n: int) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """The part of space that a block owns: what is nearest to one of its points."""
+    """The part of space that a block owns: places nearest to one of its points."""
 
     points: NDArray[np.float64]  # [P, 3] of the whole scene, world units
     owned: NDArray[np.bool_]  # [P] those of the block

@@ -2,7 +2,7 @@
 
 Views are cut where few points are seen from both sides, as at a door. A point belongs to the block
 whose views see it most, and any other place to the block of the nearest point: so a cell ends at a
-wall between two rooms, whatever the direction of that wall.
+wall between two rooms, in any direction of that wall.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ _MAX_ALONE_DEG = 2.0
 # degrees, rolled by 2, said an error of 1.9 degrees and were off by 5.2.
 _MIN_SPREAD_ALONE_DEG = 12.0
 _MAX_WITH_FLOOR_DEG = 10.0
-_MIN_UPRIGHT = 0.7  # share; a phone that was turned over halfway is no witness of which end is up
+_MIN_UPRIGHT = 0.7  # share; a phone turned over halfway does not show which end is up
 _CONE_DEG = (6.0, 15.0)  # least and greatest; in between three standard errors
 _STEPS = 50  # of the reweighting; it converges in about ten
 _FLOOR_WEIGHT = np.radians(0.5)  # rolls below this count alike: no single frame decides
@@ -97,7 +97,7 @@ _FLOOR_WEIGHT = np.radians(0.5)  # rolls below this count alike: no single frame
 
 @dataclass(frozen=True, eq=False)
 class CameraUp:
-    """What the axes of the cameras say about up."""
+    """Up as estimated from the axes of the cameras."""
 
     up: NDArray[np.float64]  # [3] unit vector
     roll_deg: float  # median angle between a camera's x axis and the horizontal plane
@@ -115,7 +115,7 @@ class Gravity:
 
     up: NDArray[np.float64] | None  # [3] unit vector, or None
     floor: Floor | None  # the floor at right angles to it, or None
-    cameras: CameraUp | None  # what the axes of the cameras say, or None where there are too few
+    cameras: CameraUp | None  # estimated from the cameras' axes; None where there are too few
     reason: str = ""  # why it is not known, for people; empty where it is
 
 
@@ -123,43 +123,43 @@ def find_gravity(points: NDArray[np.float64], viewmats: NDArray[np.float64]) -> 
     """Returns where up is by points [P, 3] and `viewmats` [C, 4, 4] world to camera."""
     if len(viewmats) < MIN_CAMERAS:
         return Gravity(None, None, None, f"there are only {len(viewmats)} cameras")
-    held = camera_up(viewmats)
-    doubt = _doubt(held)
+    measured = camera_up(viewmats)
+    doubt = _doubt(measured)
     if doubt:
-        return Gravity(None, None, held, doubt)
+        return Gravity(None, None, measured, doubt)
     centers = -np.einsum("cji,cj->ci", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    cone = float(np.clip(3 * held.error_deg, *_CONE_DEG))
-    floor = find_floor(points, centers, held.up, cone_deg=cone)
+    cone = float(np.clip(3 * measured.error_deg, *_CONE_DEG))
+    floor = find_floor(points, centers, measured.up, cone_deg=cone)
     if floor:
-        return Gravity(floor.up, floor, held)
-    if find_floor(points, centers, -held.up, cone_deg=cone):
+        return Gravity(floor.up, floor, measured)
+    if find_floor(points, centers, -measured.up, cone_deg=cone):
         return Gravity(
-            None, None, held, "the only large level surface lies above the cameras: either it is "
-            "a ceiling, or the images are upside down")
-    if held.error_deg > _MAX_ALONE_DEG or held.spread_deg < _MIN_SPREAD_ALONE_DEG:
-        return Gravity(None, None, held, f"{_loose(held)}, and the points show no floor")
-    return Gravity(held.up, None, held)
+            None, None, measured, "the only large level surface lies above the cameras: either it "
+            "is a ceiling, or the images are upside down")
+    if measured.error_deg > _MAX_ALONE_DEG or measured.spread_deg < _MIN_SPREAD_ALONE_DEG:
+        return Gravity(None, None, measured, f"{_loose(measured)}, and the points show no floor")
+    return Gravity(measured.up, None, measured)
 
 
-def _doubt(held: CameraUp) -> str:
-    """Returns why the cameras are no witness at all; empty where they are."""
-    if held.sideways:
+def _doubt(measured: CameraUp) -> str:
+    """Returns why the cameras do not show up; empty where they do."""
+    if measured.sideways:
         return "the images seem to lie on their side"
-    if held.error_deg > _MAX_WITH_FLOOR_DEG:
-        return _loose(held)
-    if held.upright < _MIN_UPRIGHT:
-        return f"{1 - held.upright:.0%} of the images are upside down against the others"
+    if measured.error_deg > _MAX_WITH_FLOOR_DEG:
+        return _loose(measured)
+    if measured.upright < _MIN_UPRIGHT:
+        return f"{1 - measured.upright:.0%} of the images are upside down against the others"
     return ""
 
 
-def _loose(held: CameraUp) -> str:
+def _loose(measured: CameraUp) -> str:
     return (
-        f"the cameras roll by {held.roll_deg:.1f} degrees and turn by {held.spread_deg:.0f}, which "
-        f"leaves up uncertain by {held.error_deg:.0f} degrees")
+        f"the cameras roll by {measured.roll_deg:.1f} degrees and turn by "
+        f"{measured.spread_deg:.0f}, which leaves up uncertain by {measured.error_deg:.0f} degrees")
 
 
 def camera_up(viewmats: NDArray[np.float64]) -> CameraUp:
-    """Returns what the axes of three or more cameras [C, 4, 4] (world to camera) say about up."""
+    """Estimates up from the axes of three or more cameras [C, 4, 4] (world to camera)."""
     right, down = viewmats[:, 0, :3], viewmats[:, 1, :3]
     up, spread, error = _normal(right)
     upright = float((down @ up < 0).mean())

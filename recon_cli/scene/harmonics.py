@@ -65,7 +65,7 @@ def generators() -> Tensor:
     A turn by the small rotation vector w changes coefficients c of degrees 1 to 3 by
     sum_i w_i (G_i c): with Y the row of basis functions, Y(R d) (c + w_i G_i c) = Y(d) c demands
     Y(d) G_i = -dY(R d)/dw_i, solved as in `rotation_blocks`. Antisymmetric; 48 entries are not 0.
-    Those are half the square roots of whole numbers, as of every angular momentum, and are rounded
+    Those are half the square roots of integers, as of every angular momentum, and are rounded
     to that: the last bits of a least-squares solution depend on the number of threads.
     """
     directions, matrices = _lattice(_DIRECTIONS).requires_grad_(), []

@@ -18,7 +18,7 @@ class ImageFile:
     """Keeps images in a file without a name; at most about `window` bytes of them are in memory.
 
     The arrays that `put` returns are views of the file, to be read only. Where the system cannot
-    be told that pages are no longer needed (Windows), it finds that out by itself.
+    be told to drop pages (Windows), it drops them by itself.
     """
 
     def __init__(self, folder: Path | None, window: int) -> None:

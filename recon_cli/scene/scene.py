@@ -1,4 +1,4 @@
-"""The views of a reconstruction, split by what each may be used for."""
+"""The views of a reconstruction, split by their permitted use."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon_cli.scene.camera import Camera
 
 _ROUNDING = 1e-4  # of a matrix in float32 or in decimals that somebody wrote
-_ORTHOGONAL = 1e-6  # what is off by more is no rotation; a product of ten rotations is off by 1e-15
+_ORTHOGONAL = 1e-6  # more than that is not a rotation; a product of ten rotations is off by 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Similarity:
         # Written so that a NaN fails too.
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if not (off < _ORTHOGONAL and np.linalg.det(rotation) > 0):
-            raise ValueError("the matrix of a similarity is no rotation")
+            raise ValueError("the matrix of a similarity is not a rotation")
         if not np.isfinite(translation).all():
             raise ValueError("the translation of a similarity is not finite")
 
@@ -82,7 +82,7 @@ class Similarity:
 
     @classmethod
     def from_matrix(cls, matrix: NDArray[np.float64]) -> Similarity:
-        """Returns the similarity that a matrix [4, 4] stands for; what rounding left is made good.
+        """Returns the similarity of a matrix [4, 4], with rounding errors repaired.
 
         Raises:
             ValueError: it stretches, shears or mirrors, is not finite, or is not affine.
@@ -111,10 +111,10 @@ class Similarity:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Similarity:
-        """Returns what `to_json` wrote.
+        """Returns the similarity that `to_json` wrote.
 
         Raises:
-            ValueError: the values are no similarity.
+            ValueError: the values are not a similarity.
             KeyError: one is missing.
         """
         return cls(

@@ -57,7 +57,9 @@ class Splats:
                 raise ValueError(f"{name} differs from means in dtype or device")
 
     @staticmethod
-    def of(parameters: Mapping[str, Tensor], backdrop: Backdrop | None = None) -> Splats:
+    def from_parameters(
+        parameters: Mapping[str, Tensor], backdrop: Backdrop | None = None
+    ) -> Splats:
         """Returns splats of the raw parameters by name; ValueError where shapes disagree."""
         return Splats(*(parameters[name] for name in PARAMETERS), backdrop=backdrop)
 
@@ -71,7 +73,7 @@ class Splats:
     def map(self, change: Callable[[Tensor], Tensor]) -> Splats:
         """Returns splats whose every parameter went through `change`."""
         changed = {name: change(value) for name, value in self.parameters().items()}
-        return Splats.of(changed, self.backdrop)
+        return Splats.from_parameters(changed, self.backdrop)
 
     def select(self, rows: Tensor) -> Splats:
         """Returns the Gaussians at `rows` ([K] indices or [N] mask), detached, in that order.
@@ -89,7 +91,7 @@ class Splats:
             raise ValueError("rows put Gaussians of degree 0 before some that have coefficients")
         taken = {name: value.detach()[rows[:count] if name == "sh_rest" else rows]
                  for name, value in self.parameters().items()}
-        return Splats.of(taken, self.backdrop)
+        return Splats.from_parameters(taken, self.backdrop)
 
     def within(self, center: Sequence[float], distance: float) -> Tensor:
         """Returns which centres lie within `distance` of `center` [3], [N] bool."""
@@ -173,7 +175,7 @@ def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
                 for name in parts[0].parameters()}
     rest = together.pop("sh_rest")  # in that order already
     rows = {name: value[order] for name, value in together.items()} | {"sh_rest": rest}
-    return Splats.of(rows, enclosing([part.backdrop for part in parts])), order
+    return Splats.from_parameters(rows, enclosing([part.backdrop for part in parts])), order
 
 
 def transformed(splats: Splats, similarity: Similarity) -> Splats:

@@ -22,7 +22,7 @@ _REACH = 4.0  # median distances beyond which a point is taken for a stray
 _MAX_BELOW = 0.05  # share under a floor; 0.2% and 0.3% in rendered rooms, more if it mirrors
 _MIN_SHARE = 0.04  # of the points; 23% and 28% in the rendered rooms
 _MIN_CONTRAST = 2.0  # times as dense as the space right above; 14 and 11 in the rendered rooms
-_MIN_WIDTH = 0.2  # of the median distance, across its narrow side: a shelf or edge is no floor
+_MIN_WIDTH = 0.2  # of the median distance, across its narrow side: shelves and edges are not floors
 # Peakiness of the best heading over that of the middling one. Measured: 2.1 and 3.0 in the rendered
 # rooms, 1.08 around a toy on a bed, up to 1.07 in clutter without walls.
 _MIN_WALLS = 1.3
@@ -45,7 +45,7 @@ class Walls:
 
     along: NDArray[np.float64]  # [3] horizontal unit vector; the other one is at right angles
     strength: float  # how much sharper the points line up along it than along a middling direction
-    found: bool  # whether that is enough to be no accident
+    found: bool  # whether that is enough to rule out chance
 
 
 def find_floor(
@@ -101,7 +101,7 @@ def find_walls(points: NDArray[np.float64], up: NDArray[np.float64]) -> Walls:
 
 
 def _near(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Returns the points that are no strays, and the median distance from their middle."""
+    """Returns the points without strays, and the median distance from their middle."""
     if not len(points):
         return points, 0.0
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)

@@ -39,7 +39,7 @@ class TrainView:
         return self.stored
 
     def page_locked(self) -> TrainView:
-        """Returns the view in memory that a GPU reads by itself while the host goes on.
+        """Returns the view in memory that a GPU reads by itself while the host continues.
 
         One that lies in a file stays there.
         """

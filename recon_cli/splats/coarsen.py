@@ -73,7 +73,7 @@ class _Moments:
             "means": self.mean, "quats": Rotation.from_matrix(axes).as_quat(scalar_first=True),
             "log_scales": np.log(scales), "logit_opacities": np.log(opacity / (1 - opacity)),
             "sh_dc": self.color[:, 0], "sh_rest": self.color[:, 1:]}
-        return Splats.of({
+        return Splats.from_parameters({
             name: torch.from_numpy(np.ascontiguousarray(value, np.float32))
             for name, value in values.items()})
 

@@ -105,7 +105,7 @@ def _all_colored(splats: Splats) -> Splats:
     rest = splats.sh_rest
     if len(rest):
         rest = with_rows(rest, len(splats))
-    return Splats.of({**splats.parameters(), "sh_rest": rest})
+    return Splats.from_parameters({**splats.parameters(), "sh_rest": rest})
 
 
 def _split(counts: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:

@@ -276,7 +276,7 @@ def _read_backdrop(header: Header) -> tuple[int, Backdrop] | None:
     """Returns the backdrop that a comment describes, after its rows; None if it cannot be read."""
     for found in filter(None, map(_BACKDROP.fullmatch, header.comments)):
         try:
-            return int(found[1]), Backdrop.of([float(text) for text in found[2].split()])
+            return int(found[1]), Backdrop.from_numbers([float(text) for text in found[2].split()])
         except ValueError:
             return None
     return None

@@ -109,7 +109,7 @@ def spz_bytes(
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is not one of {VERSIONS}")
-    values = Splats.of({
+    values = Splats.from_parameters({
         name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()})
     means, quats = values.means.numpy(), values.quats.numpy()
     log_scales = values.log_scales.numpy()

@@ -132,7 +132,7 @@ def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
     refuse_not_finite(path, plain)
     plain["sh_rest"] = trim_zero_rows(plain["sh_rest"]).copy()
-    return Splats.of({name: torch.from_numpy(value) for name, value in plain.items()})
+    return Splats.from_parameters({name: torch.from_numpy(value) for name, value in plain.items()})
 
 
 def refuse_above(path: Path, log_scales: Floats, most: float) -> None:

@@ -33,7 +33,7 @@ from recon_cli.workspace.summaries import (
 
 @dataclass(frozen=True)
 class Stage:
-    """One row: what a stage needs and how it is run."""
+    """One row: the needs of a stage and how it is run."""
 
     name: str  # its folder in the workspace and its section in recon.toml
     verb: str  # that the user types
@@ -48,17 +48,17 @@ class Stage:
     volatile: tuple[str, ...] = ()
     renders: bool = False  # it needs a rasterizer, and so torch and a device
     own_digests: bool = False  # it finds damage in its unfinished work by itself
-    takes: str = ""  # input from the user, as in usage; empty for stages that only read others
-    spares: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
+    input_metavar: str = ""  # the user's input in usage; empty for stages that only read others
+    optional_when_imported: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
     adds: bool = False  # it keeps the files of its last result that it does not write again
     # options that decide its last steps alone: where they are all that differs, it is given its
-    # last result to go on from
+    # last result to continue
     late: tuple[str, ...] = ()
 
 
 STAGES: tuple[Stage, ...] = (
     Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 5, False,
-          "recon_cli.stages.ingest", takes="VIDEO"),
+          "recon_cli.stages.ingest", input_metavar="VIDEO"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 2, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 3, True,
@@ -73,10 +73,10 @@ STAGES: tuple[Stage, ...] = (
           EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
           export_record.ExportSummary, export_record.VERSION, False, "recon_cli.stages.export",
-          renders=True, spares=("ingest", "sfm"), adds=True))
+          renders=True, optional_when_imported=("ingest", "sfm"), adds=True))
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
-               "recon_cli.stages.import_scene", renders=True, takes="FILE")
+               "recon_cli.stages.import_scene", renders=True, input_metavar="FILE")
 
 
 def stage(name: str) -> Stage:

@@ -35,7 +35,7 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
     """Writes noise.json and frames/*.png, twins of ingest's, into `out`; keeps those there.
 
     Raises:
-        FormatError: ingest's folder does not hold what its list says.
+        FormatError: ingest's folder does not fit its list.
     """
     ingest = inputs.folders["ingest"]
     names = [frame.name for frame in store.read_frame_list(ingest).frames]

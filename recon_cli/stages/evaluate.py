@@ -1,6 +1,6 @@
 """evaluate: scores every model on the held-out views, against the original pixels.
 
-The .ply is read back and rendered, so that the written file is what is measured. Writes
+The .ply is read back and rendered, so that the written file itself is measured. Writes
 metrics.json, metrics.csv, metrics.md, metrics.tex, table.txt, and pictures: renders/<model>/,
 truth/ and difference/<model>/ (absolute error times four). Pixels that a mask ignores are not
 scored: they are painted in one colour in truth/ and black in difference/.
@@ -65,7 +65,7 @@ _STRETCHES = 5  # of frames that are left out, in the tables
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What is scored and on which views."""
+    """The models to score and the views."""
 
     out: Path
     folders: Mapping[str, Path]  # of train and prune, by model
@@ -104,7 +104,7 @@ class _Evaluation:
             for name, views in self.training_views.items()}
         log = self.folders[model] / LOG
         seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
-        return ModelMetrics.of(
+        return ModelMetrics.from_views(
             scores.views, gaussians=len(splats), bytes=path.stat().st_size,
             render_ms=scores.render_ms, train_seconds=seconds,
             gain_psnr_db=scores.corrected_db if self.gains else None, seen_psnr_db=seen_db)
@@ -128,7 +128,7 @@ class _Evaluation:
                 frame.name for frame in self.frames if frame.name not in registered)}
 
     def note(self, lacking: str) -> str:
-        """Returns what the figures of the tables mean; `lacking` is why there is no LPIPS."""
+        """Returns a note on the figures of the tables; `lacking` is why LPIPS is missing."""
         sizes = " and ".join(f"{width}x{height}" for width, height in sizes_of(
             [view.camera for view in self.held_out]))
         masked = sum(view.mask is not None for view in self.held_out)
@@ -239,7 +239,7 @@ def _write(
                      f"{model.gain_psnr_db:.2f} dB\n")
         note += f"{label}, {_gap(model)}\n"
     if differences:
-        note += (f"pruned minus base: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
+        note += (f"compact minus original: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
                  f"{differences['ssim'].text('+.4f')} (95% by bootstrap over the views)\n")
     first = model_table(by_label)
     write_text(out / "table.txt", f"{first.text(rule=True)}\n{note}")
@@ -250,7 +250,7 @@ def _write(
     if len(models) == 2:
         tex += "\n" + paper_table(
             {workspace: (models["base"], models["pruned"])},
-            (metrics.label("base"), "pruned")).latex()
+            (metrics.label("base"), metrics.label("pruned"))).latex()
     write_text(out / "metrics.tex", tex)
 
 

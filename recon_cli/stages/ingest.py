@@ -40,12 +40,12 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     store.prepare_frames_folder(out)
     parts = _ingest(config, inputs.sources, out, ctx)
     source = merge_sources(parts)
-    held = _choose_held_out(source, config, ctx)
-    _check_split(source, held, config, ctx)
-    frames = tuple(replace(frame, held_out=frame.name in held) for frame in source.frames)
+    held_out = _choose_held_out(source, config, ctx)
+    _check_split(source, held_out, config, ctx)
+    frames = tuple(replace(frame, held_out=frame.name in held_out) for frame in source.frames)
     for part in parts:
         if part.selection is not None:
-            part.selection.write(out, held)
+            part.selection.write(out, held_out)
     if source.tracks is not None:
         source.tracks.write(out / TRACKS)
     FrameList(source.kind, source.groups, frames).write(out)
@@ -67,27 +67,27 @@ def _choose_held_out(
     if not source.splits:
         return store.choose_held_out(
             [frame.name for frame in source.frames], parse_holdout(config.holdout))
-    held = frozenset(frame.name for frame in source.frames if frame.held_out)
-    ctx.notice(f"The data set itself holds out {len(held)} views; --holdout has no effect.")
-    return held
+    held_out = frozenset(frame.name for frame in source.frames if frame.held_out)
+    ctx.notice(f"The data set itself holds out {len(held_out)} views; --holdout has no effect.")
+    return held_out
 
 
 def _check_split(
-    source: IngestedSource, held: frozenset[str], config: IngestConfig, ctx: StageContext
+    source: IngestedSource, held_out: frozenset[str], config: IngestConfig, ctx: StageContext
 ) -> None:
     """Refuses a split that leaves too little to train on; reports options without effect."""
-    left = len(source.frames) - len(held)
+    left = len(source.frames) - len(held_out)
     if left < MIN_TRAINED:
         raise InputError(
-            f"{len(held)} of {len(source.frames)} frames are held out, which leaves {left} to "
+            f"{len(held_out)} of {len(source.frames)} frames are held out, which leaves {left} to "
             f"train on, but at least {MIN_TRAINED} are needed.",
             hint="Hold out fewer, for example with --holdout every:8.")
-    if not held and config.holdout != "none":
+    if not held_out and config.holdout != "none":
         ctx.notice(f"--holdout {config.holdout} holds out none of {left} frames, so that nothing "
                    "can be scored.")
     if config.frames is not None and source.kind == "photos" and source.tracks is None and (
             len(source.frames) > config.frames):
-        ctx.notice("--frames has no effect on photos that are no frames of a video: all are used.")
+        ctx.notice("--frames has no effect on photos that are not frames of a video: all are used.")
 
 
 def _ingest(

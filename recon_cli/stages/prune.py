@@ -21,7 +21,7 @@ from recon_cli.workspace.summaries import PruneSummary, RoundSummary
 
 
 def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> PruneSummary:
-    """Prunes, recovers and returns what was removed and what it cost."""
+    """Prunes, recovers and returns the number removed and the cost."""
     source = load_prune_source(config, inputs, ctx)
     start = source.begin()
     n, steps, psnr_before = len(start.splats), start.steps, validation_psnr(start, source.task)

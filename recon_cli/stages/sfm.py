@@ -71,7 +71,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         _tell_time(config, job, ctx)
     runs = segments.SegmentRuns(job, {}, {}) if mapped else _run_segments(config, job, ctx)
     job = runs.job
-    process.run_job(job, progress=ctx.progress, record=ctx.record, on_idle=ctx.on_idle)
+    process.run_job(job, progress=ctx.progress, record=ctx.record, on_idle=ctx.while_idle)
     summary = _summary(frames, runs, MappingResult.read(job))
     _report(summary, frames, ctx)
     segments.remove_segments(job)

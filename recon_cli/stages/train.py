@@ -2,7 +2,7 @@
 
 Leaves splats.ply, the states at the middle (where pruning branches off) and the end of the run,
 plan.json, config.json, and log.jsonl with loss, validation PSNR, count and seconds. It begins with
-the points of sfm, or goes on from a finished model: of a shorter run, or imported. A large scene is
+the points of sfm, or continues a finished model: of a shorter run, or imported. A large scene is
 trained in blocks, by jobs of their own, and has no state at the end: its blocks were trained apart.
 """
 
@@ -35,7 +35,7 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
 def _count_blocks(
     config: TrainConfig, scene: Scene, model: FinishedModel | None, ctx: StageContext
 ) -> int:
-    """Returns how many blocks a scene is trained in; 1 for one model, and tells what that means."""
+    """Returns the number of blocks of a scene, 1 for one model; tells the user about blocks."""
     views = len(scene.train) + len(scene.validation) + len(scene.test)
     if model is None:
         count = blocks.count_blocks(views, config.blocks)

@@ -67,8 +67,8 @@ class _Sweep:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
-    """A view that is searched, and between which depths."""
+class StereoView:
+    """A view and the range of depths to search."""
 
     view: TrainView
     nearest: float  # world units
@@ -83,7 +83,7 @@ class Photo:
 
 
 def find_depths(
-    photos: Sequence[Photo], partners: NDArray[np.int64], near: float,
+    photos: Sequence[StereoView], partners: NDArray[np.int64], near: float,
     on_photo: Callable[[], None] = lambda: None, *, levels: Levels | None = None,
 ) -> list[NDArray[np.float32]]:
     """Returns a depth map [H, W] in world units of each photo, 0 where there is none.
@@ -121,9 +121,9 @@ def find_depths(
     depths = [np.where(prior > 0, _depth(inverse), np.float32(0))
               for prior, inverse in zip(priors, refined, strict=True)]
     masks = [photo.view.mask for photo in photos]
-    sure = _confirmed(depths, [camera for _, camera in full], partners, near)
+    confirmed = _confirmed(depths, [camera for _, camera in full], partners, near)
     return [np.where(there if mask is None else there & mask, depth, np.float32(0))
-            for depth, there, mask in zip(depths, sure, masks, strict=True)]
+            for depth, there, mask in zip(depths, confirmed, masks, strict=True)]
 
 
 def find_partners(
@@ -166,7 +166,7 @@ def compile_kernels() -> None:
     cameras = [Camera(_SMALL, _SMALL, _SMALL, _SMALL, _SMALL / 2, _SMALL / 2, viewmat)
                for viewmat in (np.eye(4), np.eye(4))]
     image = np.zeros((_SMALL, _SMALL, 3), np.uint8)
-    find_depths([Photo(TrainView(camera, image), 1.0, 2.0) for camera in cameras],
+    find_depths([StereoView(TrainView(camera, image), 1.0, 2.0) for camera in cameras],
                 np.array([[1], [0]]), near=0.1)
 
 
@@ -224,14 +224,14 @@ def _laid_on_planes(
 
     Matching goes by steps there, and by noise: the second search would only follow them.
     """
-    sure = _confirmed([_depth(one) for one in inverse], [camera for _, camera in images], partners,
-                      near)
-    laid = [np.zeros_like(one) for one in inverse]
-    for (image, _), found, agreed, step, result in zip(
-            images, inverse, sure, steps, laid, strict=True):
-        pool.run(lay_planes, found, image, agreed, _blankness(image), float(step), result,
+    confirmed = _confirmed(
+        [_depth(one) for one in inverse], [camera for _, camera in images], partners, near)
+    plane_depth = [np.zeros_like(one) for one in inverse]
+    for (image, _), found, certain, step, result in zip(
+            images, inverse, confirmed, steps, plane_depth, strict=True):
+        pool.run(lay_planes, found, image, certain, _blankness(image), float(step), result,
                  scratch=False)
-    return laid
+    return plane_depth
 
 
 def _blankness(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -253,11 +253,11 @@ def _confirmed(
     flat = np.concatenate([depth.reshape(-1) for depth in depths])
     starts = np.concatenate([[0], np.cumsum([depth.size for depth in depths])])[:-1]
     table = np.stack([camera_row(camera) for camera in cameras])
-    sure = []
+    confirmed = []
     for own, depth in enumerate(depths):
         agree, through = np.zeros((2, depth.size), np.int32)
         others = partners[own][partners[own] >= 0]
         pool.run(compare, flat, starts, table, own, others, _TOLERANCE, near, agree, through,
                  scratch=False)
-        sure.append(agree.reshape(depth.shape) > 0)
-    return sure
+        confirmed.append(agree.reshape(depth.shape) > 0)
+    return confirmed

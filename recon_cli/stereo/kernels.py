@@ -44,7 +44,7 @@ def match(
     A hypothesis is a plane across the view: surfaces along the planes cost no steps, and windows
     follow them (Gallup et al. 2007). Its cost is one minus the normalized correlation of a window
     with those where it falls in other views, plus their mean difference, so that smooth shading
-    counts where there is no texture. A view in which something hides the surface costs no more than
+    counts where texture is missing. A view in which something hides the surface costs no more than
     `_LEAST_SCORE` says. Costs are made smooth along eight directions
     (Hirschmueller 2008), less so across edges of the image.
 
@@ -212,7 +212,7 @@ def _warp_row(warped, inside, place, other, P, Q, R, t, y, base, slant, shift):
 def _push_row(slot, padded, warped, image, radius):
     """Writes sums along x of values, squares, products and differences of a row, [4, W].
 
-    Beyond its ends a row goes on with its last value. `warped` may be a part of `padded`.
+    Beyond its ends a row repeats its last value. `warped` may be a part of `padded`.
     """
     width = len(image)
     here = slice(radius, radius + width)
@@ -367,7 +367,7 @@ def _choose(inverse, least, total, base, slants, lowest, step):
 
 
 @kernel
-def lay_planes(counter, inverse, image, sure, blank, step, laid):
+def lay_planes(counter, inverse, image, confirmed, blank, step, plane_depth):
     """Lays a plane through the inverse depths about each blank pixel.
 
     An inverse depth that is linear in the place in the image is a plane in the room. Each is fitted
@@ -376,9 +376,9 @@ def lay_planes(counter, inverse, image, sure, blank, step, laid):
     Args:
         counter: [1] shared; rows already taken.
         inverse: [H, W] float32, 0 for none; image: [H, W] float32 grey levels.
-        sure: [H, W] whether another view agrees; blank: [H, W] float32, share of the plane.
+        confirmed: [H, W] whether another view agrees; blank: [H, W] float32, share of the plane.
         step: between two hypotheses.
-        laid: [H, W] float32 out.
+        plane_depth: [H, W] float32 out.
     """
     height, width = inverse.shape
     while True:
@@ -387,7 +387,7 @@ def lay_planes(counter, inverse, image, sure, blank, step, laid):
             break
         for x in range(width):
             at, across, down = float(inverse[y, x]), 0.0, 0.0
-            laid[y, x] = inverse[y, x]
+            plane_depth[y, x] = inverse[y, x]
             if blank[y, x] < _LEAST_BLANK or at <= 0:
                 continue
             grey = 1 / (_GREY * _GREY)
@@ -410,7 +410,7 @@ def lay_planes(counter, inverse, image, sure, blank, step, laid):
                         w = 1 - off / _CUT  # to the fourth about exp(-off / 2)
                         w *= w
                         w *= w
-                        if not sure[y + j, x + i]:
+                        if not confirmed[y + j, x + i]:
                             w *= _UNSURE
                         n += w
                         sx += w * i
@@ -427,7 +427,7 @@ def lay_planes(counter, inverse, image, sure, blank, step, laid):
                 divisor = xx * yy - xy * xy
                 across, down = (xv * yy - yv * xy) / divisor, (yv * xx - xv * xy) / divisor
                 at = mv - across * mx - down * my
-            laid[y, x] += blank[y, x] * (max(at, 0.0) - inverse[y, x])
+            plane_depth[y, x] += blank[y, x] * (max(at, 0.0) - inverse[y, x])
 
 
 @kernel

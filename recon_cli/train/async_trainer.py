@@ -30,7 +30,7 @@ _FARTHEST = 100  # steps between two meetings, so that Ctrl-C and a progress bar
 
 @dataclass(frozen=True, eq=False)
 class _Before:
-    """What the host knew before a step."""
+    """The host's state before a step."""
 
     iteration: int  # steps done
     queue: list[int]  # views to come

@@ -1,4 +1,4 @@
-"""What the sparse points leave out: blank surfaces, and what lies far outside, behind windows.
+"""Regions without sparse points: blank surfaces, and far places outside, behind windows.
 
 Structure from motion finds few points there, so training would paint them on whatever is near.
 Parts of the pictures without points get Gaussians at the depth of the points around. Behind them,
@@ -68,7 +68,7 @@ class FarContent:
 
     @staticmethod
     def nothing() -> FarContent:
-        """Returns what is found where the points cover all."""
+        """Returns the result where the points cover all."""
         return FarContent(np.zeros((0, 3)), np.zeros((0, 3)), 1.0, 0.0)
 
 
@@ -112,7 +112,7 @@ class _SearchView:
 
 
 def _search_view(view: TrainView, points: NDArray[np.float64]) -> _SearchView:
-    """Returns what a view shows of the points."""
+    """Returns the points that a view shows."""
     small = _for_search(view)
     free = ~_cover_mask(small, points)
     if small.mask is not None:
@@ -157,7 +157,7 @@ def _find_gaps(searched: Sequence[_SearchView]) -> tuple[NDArray[np.float64], ND
 def _place_gaps(
     shown: _SearchView,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Returns places [K, 3] of what one view shows without points, their colours and depths."""
+    """Returns places [K, 3] in one view's regions without points, their colours and depths."""
     camera = shown.view.camera
     line, column = np.mgrid[_GAP_GRID // 2:camera.height:_GAP_GRID,
                             _GAP_GRID // 2:camera.width:_GAP_GRID]
@@ -186,7 +186,7 @@ def _seen_through(
 
 
 def faces(view: TrainView, content: FarContent, points: NDArray[np.float64]) -> bool:
-    """Tells whether a view sees some of what lies far outside, past the points [P, 3]."""
+    """Tells whether a view sees places far outside, past the points [P, 3]."""
     small = _for_search(view)
     _, column, line = project_points(small.camera, content.positions)
     return int((~_cover_mask(small, points)[line, column]).sum()) >= _FACING

@@ -50,7 +50,7 @@ LEAST_VIEWS = 20  # of a block, so that each view of it has neighbours
 MERGE_SHARE = 0.2  # of the work, about, that is left when all blocks are trained
 STAGE = "train"  # name of a block's result in its folder
 COMMAND = "train-block"  # of recon, which takes JOB
-JOB, OUTPUT = "block.safetensors", "output.txt"  # what to do, and what the command printed
+JOB, OUTPUT = "block.safetensors", "output.txt"  # the command's input and output
 _VERSION = 1
 
 
@@ -74,7 +74,7 @@ def count_blocks(views: int, asked: str) -> int:
 
 @dataclass(frozen=True, eq=False)
 class BlockJob:
-    """What is trained as one block, and where."""
+    """The training of one block, and its folder."""
 
     folder: Path  # of this block
     inputs: StageInputs  # of the stage: the whole scene
@@ -95,7 +95,7 @@ class BlockJob:
 
     @property
     def key(self) -> ResultKey:
-        """Everything that decides what comes out of it."""
+        """Everything that decides its result."""
         part = {"views": sorted(self.views), "validation": sorted(self.validation),
                 "owned": hashlib.sha256(self.cell.owned.tobytes()).hexdigest()}
         return ResultKey(
@@ -277,7 +277,7 @@ def _asked(ctx: StageContext) -> ComputeConfig:
 def _start_executor(
     jobs: Sequence[BlockJob], config: TrainConfig, ctx: StageContext
 ) -> tuple[Executor, int]:
-    """Returns what trains blocks, and the threads of each: on this machine they share all."""
+    """Returns the executor of blocks, and the threads of each: on this machine they share all."""
     folder, compute = jobs[0].folder.parent, _asked(ctx)
     if config.on == "ray":
         return start_executor(

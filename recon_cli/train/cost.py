@@ -1,4 +1,4 @@
-"""What a run will take, from a few timed steps, reports and checkpoints before it."""
+"""The expected time of a run, from a few timed steps, reports and checkpoints before it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class LevelCost:
 
 @dataclass(frozen=True)
 class CostModel:
-    """What the parts of a run take on this machine."""
+    """The time that the parts of a run take on this machine."""
 
     levels: tuple[LevelCost, ...]  # of the steps, finest first
     report: LevelCost  # of one look at all validation views
@@ -106,7 +106,7 @@ def calibrate(
     clock: Clock = time.perf_counter,
     seconds: float,
 ) -> CostModel:
-    """Returns what the parts of a run take, by a few timed steps at each level, the coarsest first.
+    """Returns the times of the parts of a run, by a few timed steps at each level, coarsest first.
 
     About `seconds` are spent; after twice that, the remaining levels are told from the one before.
     The cap of the schedule is the larger count that is timed. `scratch` is a file for a checkpoint,
@@ -242,7 +242,7 @@ def _middle(schedule: Schedule, level: int) -> int:
 def _grow_splats(
     points: NDArray[np.float64], colors: NDArray[np.uint8], count: int, sh_degree: int
 ) -> Splats:
-    """Returns `count` Gaussians that cost what trained ones do: the points', split at random."""
+    """Returns `count` Gaussians that cost as much as trained ones: the points', split at random."""
     splats = splats_from_points(points, colors, most=max(count, 1), seed=0, sh_degree=sh_degree)
     rule, generator = densification.BudgetRule(count, 0.0, 1.0), torch.Generator().manual_seed(0)
     while 1 < len(splats) < count:

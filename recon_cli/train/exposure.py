@@ -1,4 +1,4 @@
-"""What the colours of sparse points say about exposure before any training.
+"""Estimates exposure from the colours of sparse points, before any training.
 
 A point shows the same surface to all views: the ratio of its colours in two views is that of their
 gains. Occlusion makes some ratios wrong, which the median over all shared points ignores.
@@ -39,7 +39,7 @@ class Exposure:
         return self._rows.value.numpy().copy()
 
     def gain(self, image: int) -> NDArray[np.float32]:
-        """Returns what the rendered channels of an image are multiplied by, [3]."""
+        """Returns the factors of the rendered channels of an image, [3]."""
         return np.asarray(np.exp(self._rows.value[image].numpy()), np.float32)
 
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
@@ -55,7 +55,7 @@ class Exposure:
         return self._rows.tensors(_PREFIX)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Restores what `tensors` returned."""
+        """Restores the state that `tensors` returned."""
         self._rows.restore(_PREFIX, tensors)
 
 

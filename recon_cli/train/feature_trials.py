@@ -39,7 +39,7 @@ _ERRORS = 1.65  # standard errors, a chance of about one in twenty
 _ERRORS_AGAINST = 1.0  # of a loss; what is on without a trial needs less to go off
 LEAST_VIEWS = 8  # whose mean has a standard error that can be told; fewer, and the split is own
 _SPLIT = 6  # each sixth training view is held out by an own split, or sooner each third or more
-_DENSEST = 3  # of few views; what is left must still hang together
+_DENSEST = 3  # of few views; the rest must still hang together
 
 Arm = Callable[[], Sequence[float]]
 
@@ -123,7 +123,7 @@ def model_parts(config: RunConfig) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a scene needs beyond plain Gaussians."""
+    """The optional parts that a scene needs beyond plain Gaussians."""
 
     config: RunConfig  # with every optional part on or off
     decisions: tuple[TrialDecision, ...]  # why, one for each part that was left automatic
@@ -135,8 +135,8 @@ class Needs:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """A scene for which the parts of the model are chosen."""
+class TrialScene:
+    """A scene whose optional parts are chosen by trials."""
 
     task: Task  # views at the training size, and the plan
     points: NDArray[np.float64]  # [P, 3] sparse points in world units
@@ -146,8 +146,8 @@ class Candidate:
     harmonics: bool = False  # the degree of the colours is left to a trial
 
 
-def examine(scene: Candidate) -> Needs:
-    """Returns what a scene needs; parts that the options switch on or off are not tried."""
+def examine(scene: TrialScene) -> Needs:
+    """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     config = scene.task.schedule.config
     if config.stereo == "auto":
         config = replace(config, stereo="on")
@@ -192,7 +192,7 @@ def _with(config: RunConfig, part: str, value: str) -> RunConfig:
 class _Bench:
     """Short runs on the views of a scene."""
 
-    def __init__(self, scene: Candidate) -> None:
+    def __init__(self, scene: TrialScene) -> None:
         self._scene, task = scene, scene.task
         needs_far = task.schedule.config.far != "off"
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
@@ -203,7 +203,7 @@ class _Bench:
         self._scores: dict[tuple[object, ...], list[float]] = {}
 
     def try_part(self, part: str, config: RunConfig, value: str) -> TrialDecision:
-        """Returns whether a part pays on top of what is on already."""
+        """Returns whether a part pays on top of those that are on already."""
         if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
             return skip_trial(part, "there are too few views to try it on")
         without, with_it = _with(config, part, _word(part, on=False)), _with(config, part, value)
@@ -277,7 +277,7 @@ class _Bench:
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
                      task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
-        # reduced views would be reduced once more in the search for what lies far outside
+        # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)
         return [mean_psnr(state.splats, [reduce_view(view, LEVEL)], config.sh_degree, task.backend,

@@ -1,6 +1,6 @@
-"""The finished model that a training goes on from: of a shorter run, or an imported scene.
+"""The finished model that a training continues: of a shorter run, or an imported scene.
 
-A run that goes on takes steps of their own after the end of that model (`ContinuedSchedule`), and
+A continued run takes steps of their own after the end of that model (`ContinuedSchedule`), and
 keeps the parts of it: no trial is repeated. What is known of an imported scene stays with the
 result, since whoever trained it may have seen the held-out views.
 """
@@ -68,7 +68,7 @@ class FinishedModel:
         return self.steps > 0
 
     def choose_parts(self, asked: TrainConfig) -> dict[str, Any]:
-        """Returns the parts of the model that goes on, by the names of their options.
+        """Returns the parts of the continued model, by the names of their options.
 
         A trained one keeps its own. To an imported scene those are added that were asked for.
 
@@ -80,8 +80,8 @@ class FinishedModel:
         for name in ("far", "stereo"):
             if getattr(asked, name) == "on":
                 raise ConfigError(
-                    f"{name} is on, but an imported scene has the Gaussians that it has: others "
-                    "are added to the points of sfm only.", hint=f"Leave out --{name}.")
+                    f"{name} is on, but an imported scene keeps its Gaussians: others are "
+                    "only added to the points of sfm.", hint=f"Leave out --{name}.")
         if asked.max_gaussians is not None and asked.max_gaussians < self.gaussians:
             raise ConfigError(
                 f"max_gaussians is {asked.max_gaussians:,}, but the imported scene has "
@@ -92,10 +92,10 @@ class FinishedModel:
         return {name: own[name] if value in (None, "auto") else value
                 for name, value in given.items()}
 
-    def hand_on(self, schedule: Schedule, out: Path, ctx: StageContext) -> None:
-        """Writes what the result takes over into its folder, and tells the user of the start."""
+    def write_inherited_files(self, schedule: Schedule, out: Path, ctx: StageContext) -> None:
+        """Writes the inherited files into the result's folder, and tells the user of the start."""
         if self.trained:
-            logger.info("training goes on from step %s of the finished run", f"{self.steps:,}")
+            logger.info("training continues from step %s of the finished run", f"{self.steps:,}")
             if schedule.steps < _FEW * self.steps:
                 ctx.notice(f"{schedule.steps:,} more steps than {self.steps:,} are too few to gain "
                            "anything: learning rates start anew")

@@ -38,7 +38,7 @@ def fit(
         if state.iteration % every == 0 or state.iteration == until:
             psnr = validation_psnr(state, task)
             regular = state.iteration % every == 0
-            goes_on_at = _goes_on_at(state, task, psnr) if regular else None
+            goes_on_at = _skip_to_iteration(state, task, psnr) if regular else None
             report = TrainReport(
                 state.iteration, loss, psnr, len(state.splats), time.perf_counter() - start,
                 time.process_time() - cpu_start, goes_on_at)
@@ -51,8 +51,8 @@ def fit(
             callback.on_step(state.iteration, state.splats)
 
 
-def _goes_on_at(state: TrainState, task: Task, psnr: float | None) -> int | None:
-    """Returns the iteration to which the run jumps now, None where it just goes on."""
+def _skip_to_iteration(state: TrainState, task: Task, psnr: float | None) -> int | None:
+    """Returns the iteration to which the run jumps now, None where it just continues."""
     if task.jump is not None:
         return task.jump[1] if state.iteration == task.jump[0] else None
     if psnr is None or not task.schedule.config.early_stop or state.jump:

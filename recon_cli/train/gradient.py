@@ -46,7 +46,7 @@ class GradientStep(Protocol):
 
 
 class DeferredStep(GradientStep, Protocol):
-    """A gradient step that can also be started without waiting for what comes of it."""
+    """A gradient step that can also be started without waiting for its result."""
 
     @property
     def counted(self) -> Tensor:
@@ -54,13 +54,13 @@ class DeferredStep(GradientStep, Protocol):
 
     @property
     def status(self) -> StepStatus:
-        """What the device records of each view."""
+        """The device's record of each view."""
 
     def start(self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions) -> Statistics:
         """Starts the work on one view and returns its statistics, zeros where it counts nothing."""
 
     def close(self) -> StepReport:
-        """Waits for the work, and tells what became of the views since it was last called."""
+        """Waits for the work, and tells the outcome of the views since it was last called."""
 
 
 def gradient_step(backend: str, device: torch.device | str = "cpu") -> GradientStep:

@@ -24,7 +24,7 @@ _PERCENTILE = 0.9  # the volume at the ascending 90th percentile (equation 5)
 
 @dataclass(eq=False)
 class Importance:
-    """What the training views say about N Gaussians, added up; see `Statistics`."""
+    """Statistics of N Gaussians, added up over the training views; see `Statistics`."""
 
     hits: Tensor  # [N] int64, pixels that the Gaussian contributes to
     blend_max: Tensor  # [N] float64, greatest alpha T
@@ -50,7 +50,7 @@ class Importance:
 
     @property
     def needs_views(self) -> bool:
-        """Whether the score is about what views show at all."""
+        """Whether the score depends on the views at all."""
         return self.weighs or self.leaves_out
 
     def add(self, statistics: Statistics) -> None:
@@ -96,7 +96,7 @@ def _log_volumes(splats: Splats) -> Tensor:
 def add_views(
     found: Importance, splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str
 ) -> None:
-    """Adds what a pass over views with their masks finds; never give it held-out views."""
+    """Adds the statistics of a pass over views with their masks; never give it held-out views."""
     device = splats.means.device
     leaves = splats.map(lambda tensor: tensor.detach().requires_grad_(found.leaves_out))
     for view in views:

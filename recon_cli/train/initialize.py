@@ -1,4 +1,4 @@
-"""The state before the first step, by what the options say is part of the model."""
+"""The state before the first step, with the parts of the model that the options name."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def first_state(
     if far is not None:
         points = np.concatenate([points, far.gap_points])
         colors = np.concatenate([colors, far.gap_colors])
-    # what is added does not take the place of sparse points as long as there is room to grow
+    # added Gaussians do not take the place of sparse points as long as there is room to grow
     most = max(most, min(most + len(points) - sparse, config.max_gaussians // 2))
     grey = task.schedule.recipe.backdrop
     centers = np.stack([view.camera.center for view in task.train])
@@ -152,7 +152,7 @@ def first_splats(
     config: RunConfig, points: NDArray[np.float64], colors: NDArray[np.uint8],
     far: FarContent | None, *, most: int,
 ) -> Splats:
-    """Returns the Gaussians before the first step: of the points, and of what lies far outside."""
+    """Returns the Gaussians before the first step: of the points, and of places far outside."""
     outside = 0 if far is None else len(far.positions)
     near = splats_from_points(
         points, colors, most=max(most // 2, min(most, config.max_gaussians - outside)),

@@ -1,9 +1,9 @@
 """One model of the blocks of a scene, which were trained apart.
 
-Each block keeps the Gaussians in its cell; what it trained around that, so that nothing floats at
-its border, belongs to others. Then all Gaussians are fine-tuned on all views: those at a wall reach
-through to the other side, which no view of their own block sees, and what lies far away was fitted
-by each block for itself.
+Each block keeps the Gaussians in its cell; those trained around it, so that nothing floats at its
+border, belong to others. Then all Gaussians are fine-tuned on all views: those at a wall reach
+through to the other side, which no view of their own block sees, and each block fitted
+distant places for itself.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SEAM_DROP_DB = 1.0  # of a view against the block that trained it; a visible sea
 
 @dataclass(frozen=True, eq=False)
 class TrainedBlock:
-    """A block's model, and what it owns."""
+    """A block's model, and the part of space that it owns."""
 
     name: str
     splats: Splats
@@ -135,7 +135,7 @@ def _summarize(
 def _run_config(
     blocks: Sequence[TrainedBlock], steps: int, count: int, degree: int
 ) -> RunConfig:
-    """Returns the options of the fine-tuning: what the blocks were trained with."""
+    """Returns the options of the fine-tuning: those of the blocks."""
     configs = [block.config for block in blocks]
     denoised = all(each.images == "denoised" for each in configs)
     drifting = steps > 0 and any(each.exposure == "on" for each in configs)
@@ -159,7 +159,7 @@ def _finetune(
     room = gaussians_that_fit(scene, config, ctx)
     if room < len(splats):
         ctx.notice(f"the merged scene has {len(splats):,} Gaussians, but memory has room to train "
-                   f"{room:,}: it is not fine-tuned as a whole, and borders may show")
+                   f"{room:,}: the merged scene is not fine-tuned, and borders may show")
         return None
     slower = dataclasses.replace(config, **{
         name: _OTHER_RATES * getattr(config, name)
@@ -190,7 +190,7 @@ def _own(block: TrainedBlock) -> Splats:
 def _seam_changes(
     splats: Splats, blocks: Sequence[TrainedBlock], max_size: int, scene: Scene, ctx: StageContext
 ) -> dict[str, float]:
-    """Returns what validation views of several blocks gain over the best of these, in dB by name.
+    """Returns the gain of validation views of several blocks over the best of these, dB by name.
 
     A block's own model has no seam where its view looks into another cell.
     """

@@ -28,11 +28,11 @@ def fit_scene(
 ) -> TrainSummary:
     """Fits Gaussians to the views of a scene and returns how far it came.
 
-    `model` is what the run goes on from, None for a run that begins anew.
+    `model` is the one that the run continues, None for a run that begins anew.
     """
     task = plan_task(config, scene, out, ctx, model)
     if model is not None and not (out / CHECKPOINT).exists():
-        model.hand_on(task.schedule, out, ctx)
+        model.write_inherited_files(task.schedule, out, ctx)
     state = first_or_saved(task, scene, out / CHECKPOINT, model)
     until = task.schedule.config.iterations
     run_fit(state, task, until, Segment(

@@ -86,10 +86,10 @@ class SplatOptimizer:
             held = self._buffers.get(name, {}).get("value")
             if held is None or held.shape != (room, *value.shape[1:]):
                 self._reserve(name, value, room)
-        self.splats = Splats.of({
+        self.splats = Splats.from_parameters({
             name: self._view(name, "value").detach().requires_grad_() for name in self._buffers
         }, like.backdrop)
-        self.gradients = Splats.of({
+        self.gradients = Splats.from_parameters({
             name: self._view(name, "gradient") for name in self._buffers
         }) if self.fused else self.splats
 
@@ -220,7 +220,7 @@ class SplatOptimizer:
         return result
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Takes moments and the step count back from what `tensors` returned."""
+        """Restores moments and the step count from `tensors`."""
         self._taken.fill_(int(tensors["adam.count"]))
         for name in self._buffers:
             for role in _MOMENTS:
@@ -242,7 +242,7 @@ class SparseAdam:
     """Adam (Kingma and Ba 2015, algorithm 1) that counts the steps of each row on its own.
 
     A row that was stepped for the first time moves by its rate, however late that is. The table
-    `value` is [F, D] float64 on the CPU, so that it is the same whatever the device.
+    `value` is [F, D] float64 on the CPU, so that it is the same on every device.
     """
 
     def __init__(self, start: Tensor) -> None:
@@ -271,7 +271,7 @@ class SparseAdam:
         return {f"{prefix}.{role}": self._tensor(role) for role in _ROW_ROLES}
 
     def restore(self, prefix: str, tensors: dict[str, Tensor]) -> None:
-        """Restores what `tensors` returned.
+        """Restores the state that `tensors` returned.
 
         Raises:
             KeyError: one is missing.

@@ -1,6 +1,6 @@
-"""What training decides before its first step: parts of the model, steps, cap of the count.
+"""Decisions before the first training step: parts of the model, steps, cap of the count.
 
-The plan is recorded, and an interrupted run goes on by the record: whatever a clock or a trial
+The plan is recorded, and an interrupted run continues by the record: whatever a clock or a trial
 would say now, the same numbers give the same bytes.
 """
 
@@ -23,7 +23,7 @@ from recon_cli.context import StageContext
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate
-from recon_cli.train.feature_trials import Candidate, Needs, examine, model_parts
+from recon_cli.train.feature_trials import Needs, TrialScene, examine, model_parts
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.initialize import first_state, restore_state, surfaces_of
 from recon_cli.train.schedule import RECIPES, Schedule, make_schedule
@@ -60,7 +60,7 @@ logger = logging.getLogger("recon")
 
 @dataclass(frozen=True)
 class Quality:
-    """What --quality stands for; the same on every machine, so that results are, too."""
+    """The preset of --quality; the same on every machine, so that results are, too."""
 
     iterations: int  # steps
     max_size: int  # longest side of a training image in pixels
@@ -73,7 +73,7 @@ QUALITIES = {"draft": Quality(1500, 400), "normal": Quality(2400, 600), "high": 
 
 @dataclass(frozen=True)
 class Facts:
-    """What a plan needs to know about a scene."""
+    """The facts on a scene that a plan needs."""
 
     detail: int  # of `count_detail`
     views: int  # to train on
@@ -90,7 +90,7 @@ def first_config(asked: TrainConfig) -> RunConfig:
 
 
 def run_config(asked: TrainConfig, plan: TrainPlan) -> RunConfig:
-    """Returns the options of the run: what was asked for, and the plan's numbers for the rest."""
+    """Returns the options of the run: those given, and the plan's numbers for the rest."""
     return _fill_in(asked, plan.iterations, plan.max_gaussians, plan.max_size)
 
 
@@ -106,7 +106,7 @@ def make_plan(
 ) -> TrainPlan:
     """Returns the plan; --minutes include the calibration and the seconds `spent` on trials.
 
-    `model` is what the run goes on from.
+    `model` is the one that the run continues.
     """
     continues_at = None if model is None else model.steps
 
@@ -130,7 +130,7 @@ def make_plan(
 
 
 def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
-    """Returns the cap of the count: what was asked for, or what images, steps and memory bear.
+    """Returns the cap of the count: the option's, or the limit of images, steps and memory.
 
     A Gaussian for each pixel of a mean view that holds detail, after 2,400 steps; in other runs by
     the square root of the steps, as a new Gaussian must still find its place. No more than an
@@ -181,7 +181,7 @@ def _fill_in(asked: TrainConfig, iterations: int, max_gaussians: int, max_size: 
 
 
 def _largest(fits: Callable[[int], bool], low: int, high: int) -> int:
-    """Returns the largest whole number in [low, high] that fits; `low` where none does."""
+    """Returns the largest integer in [low, high] that fits; `low` where none does."""
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if fits(middle) else (low, middle - 1)
@@ -194,7 +194,7 @@ def plan_task(
 ) -> Task:
     """Returns the task of a run by its plan: a recorded one, or one that is made and recorded.
 
-    `model` is what the run goes on from: it keeps the parts of that.
+    `model` is the one that the run continues, with its parts.
     """
     if (out / TrainPlan.FILE).exists():
         recorded = dataclasses.replace(read_config(out), checkpoint_every=config.checkpoint_every)
@@ -240,7 +240,7 @@ def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool
 
     changed = config.images == "auto" and any(
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
-    needs = examine(Candidate(
+    needs = examine(TrialScene(
         task, scene.points, scene.colors, twins if changed else None, harmonics))
     for decision in needs.decisions:
         logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)

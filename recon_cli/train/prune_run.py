@@ -1,4 +1,4 @@
-"""A pruning run on disk: it goes on after a kill, and may search how much can go.
+"""A pruning run on disk: it resumes after a kill, and may search the largest ratio.
 
 `round-<k>.safetensors` is a state after the k-th removal, `rounds.json` lists the removals. The
 state is written first and the list after it: a kill in between repeats the round before, to the
@@ -48,7 +48,7 @@ _LEAST_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Round(JsonRecord):
-    """One removal and what became of it. PSNR is None where there are no validation views."""
+    """One removal and its outcome. PSNR is None where there are no validation views."""
 
     iteration: int  # steps done before it
     gaussians_before: int  # count
@@ -87,15 +87,15 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     """
     train = inputs.folders["train"]
     final = train / "final.safetensors"
-    whole = final.exists()  # else the scene was imported, or merged from blocks
-    import_record = None if whole else ImportRecord.read(train)
+    single = final.exists()  # else the scene was imported, or merged from blocks
+    import_record = None if single else ImportRecord.read(train)
     if import_record and config.at == "mid":
         raise ConfigError(
             f"at is mid, but the scene was imported from {import_record.file}: the middle of its "
             "training is not known.", hint="Prune it with --at end.")
     if import_record and import_record.doubt:
         ctx.notice(import_record.doubt)
-    if config.at == "mid" and not whole:
+    if config.at == "mid" and not single:
         ctx.notice("The blocks that the scene was trained in have no common middle: the finished "
                    "model is pruned.")
         config = dataclasses.replace(config, at="end")
@@ -105,7 +105,7 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     path = train / "mid.safetensors" if config.at == "mid" else final
 
     def begin() -> TrainState:
-        if not whole:
+        if not single:
             return make_finished_state(read_ply(train / "splats.ply"), task)
         return restore_state(path, task)
 
@@ -114,17 +114,17 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     if steps is None:
         steps = max(train_config.iterations // _END_RECOVERY, _END_EPOCHS * epoch)
         if config.at == "mid":
-            # as many as the unpruned run took, which may have stopped early; where that went on for
+            # as many as the unpruned run took, which may have stopped early; where it continued for
             # a few steps only, too few to recover
             rest = restore_state(final, task).steps - start.steps
-            steps = max(rest, steps) if _went_on(train) else rest
+            steps = max(rest, steps) if _was_continued(train) else rest
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
         config.rounds or rounds_within(steps, epoch), seconds_at(train / LOG, start.iteration))
 
 
-def _went_on(train: Path) -> bool:
-    """Returns whether a training went on from a finished model."""
+def _was_continued(train: Path) -> bool:
+    """Returns whether a training continued a finished model."""
     plan = TrainPlan.read(train) if (train / TrainPlan.FILE).exists() else None
     return plan is not None and plan.continues_at is not None
 
@@ -198,12 +198,12 @@ class StoredPruneRun(PruneRun):
             restore_state(good, self.source.task) if good.exists() else self.source.begin())
 
     def write_rounds(self) -> None:
-        """Writes the list of rounds, whole or not at all."""
+        """Writes the list of rounds atomically."""
         rows = [row.to_json() for row in self.done]
         write_bytes(self._out / ROUNDS, json.dumps(rows, indent=1).encode())
 
     def clear(self) -> None:
-        """Deletes what only a resumed run would have needed."""
+        """Deletes the files that only a resumed run would have needed."""
         for path in (*self._out.glob(_name("*")), self._out / GOOD):
             delete(path)
 

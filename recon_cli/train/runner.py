@@ -36,7 +36,7 @@ class Segment:
     until: int  # step at its end
     first: int = 0  # step at which it begins
     earlier_seconds: float = 0.0  # training seconds before that
-    checkpoint: str = CHECKPOINT  # file name of the state that a later run goes on from
+    checkpoint: str = CHECKPOINT  # file name of the state that a later run continues
     # file names under which the state after certain steps is kept
     keep: Mapping[int, str] = field(default_factory=dict)
 
@@ -85,14 +85,14 @@ def seconds_at(log: Path, iteration: int, *, clock: str = "seconds") -> float:
 
 
 class TrainLog(TrainCallback):
-    """Writes one JSON line a report; what a crash left behind the checkpoint is cut off."""
+    """Writes one JSON line a report; lines after the checkpoint of a crashed run are cut off."""
 
     def __init__(self, path: Path, iteration: int, earlier_seconds: float) -> None:
         self._path = path
         lines = path.read_text(encoding="utf-8").splitlines(True) if path.exists() else []
         # a kill in mid-write leaves a last line without its end
-        whole = [line for line in lines if line.endswith("\n")]
-        valid = [line for line, row in zip(whole, LogRow.read_all(path), strict=True)
+        complete = [line for line in lines if line.endswith("\n")]
+        valid = [line for line, row in zip(complete, LogRow.read_all(path), strict=True)
                  if row.iteration <= iteration]
         if not valid:  # a branch starts where the other run stood
             first = {"iteration": iteration, "seconds": earlier_seconds, "cpu_seconds": 0.0}
@@ -107,12 +107,12 @@ class TrainLog(TrainCallback):
         self._write(dataclasses.asdict(report), report.seconds, report.cpu_seconds)
 
     def add_idle(self, iteration: int, seconds: float, cpu_seconds: float) -> None:
-        """Counts time in which no step was taken, and keeps what was logged for a later run."""
+        """Counts time in which no step was taken, and keeps the log for a later run."""
         self._write({"iteration": iteration}, seconds, cpu_seconds)
         self.keep()
 
     def keep(self) -> None:
-        """Records what a later run that goes on from here must find in the log."""
+        """Records the log up to here, for a later run that continues from here."""
         journal.expect_growth(self._path)
 
     def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
@@ -139,12 +139,12 @@ class ProgressCallback(TrainCallback):
         validation = "" if psnr is None else f", validation {psnr:.2f} dB"
         self._bar.note(f"loss {report.loss:.4f}{validation}, {report.gaussians:,} Gaussians")
         if report.goes_on_at is not None:
-            logger.info("the validation views gain nothing more after step %d: the run goes on at "
+            logger.info("the validation score is flat after step %d: the run continues at "
                         "step %d, with falling rates", report.iteration, report.goes_on_at)
 
 
 class CheckpointThrottle:
-    """Limits the time that checkpoints take; changes when a state is saved, never what is."""
+    """Limits the time that checkpoints take; changes when a state is saved, never its content."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock, self._last, self._took = clock, clock(), 0.0

@@ -58,7 +58,7 @@ class Recipe:
     means_unit: Literal["extent", "nearness"]
     # factors of the options of these names: short runs have to go as far as the reference's 30,000
     means_rate: float = 1.0
-    means_again: float = 1.0  # of the means' rate after the end of a run: they are in their places
+    means_restart_rate: float = 1.0  # of the means' rate in a continued run: they hardly move
     scales_rate: float = 1.0
     sh_rate: float = 1.0
     sh_rest_rate: float = 1.0  # of the higher degrees, each time that they are moved
@@ -77,8 +77,9 @@ REFERENCE = Recipe(
 BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
     sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False,
-    replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=7.0, means_again=0.7,
-    scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8, final_from=0.8, final_rate=0.1,
+    replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=7.0,
+    means_restart_rate=0.7, scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8,
+    final_from=0.8, final_rate=0.1,
     backdrop=0.33)
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
@@ -209,7 +210,7 @@ class ContinuedSchedule(Schedule):
 
     def means_rate(self, iteration: int) -> float:
         """Returns the learning rate of the means in units of `Task.means_unit`."""
-        return self.recipe.means_again * super().means_rate(iteration)
+        return self.recipe.means_restart_rate * super().means_rate(iteration)
 
     def sh_degree(self, iteration: int) -> int:  # noqa: ARG002
         """Returns the degree in use, which is the highest."""

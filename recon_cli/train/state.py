@@ -1,4 +1,4 @@
-"""All that a run needs to go on with the very same bytes, and its checkpoint (safetensors)."""
+"""All that a run needs to resume with the very same bytes, and its checkpoint (safetensors)."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ class TrainState:
     """A run after `iteration` steps."""
 
     optimizer: SplatOptimizer  # holds the splats and their moments
-    gathered: DensificationStats  # what steps left behind for densification
-    generator: torch.Generator  # source of every random choice; on the CPU whatever the device
+    gathered: DensificationStats  # gathered by steps, for densification
+    generator: torch.Generator  # source of every random choice; always on the CPU
     iteration: int = 0  # steps done
     # indices of the views still to come in this epoch, last first
     queue: list[int] = field(default_factory=list)
@@ -88,7 +88,7 @@ class TrainState:
     skipped: int = 0  # steps whose loss was not finite, and that changed nothing
     # (iteration, validation PSNR in dB) at each regular report so far
     looks: list[tuple[int, float]] = field(default_factory=list)
-    jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it went on
+    jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it continued
     exposure: Exposure | None = None  # gains of the training images; None where that part is off
 
     @property
@@ -115,7 +115,7 @@ def new_state(
 
 
 def save_state(path: Path, state: TrainState) -> None:
-    """Writes a checkpoint, whole or not at all.
+    """Writes a checkpoint atomically.
 
     Raises:
         TrainingError: a parameter is not finite; the checkpoint before it stays.
@@ -162,7 +162,8 @@ def load_state(
         generator.set_state(tensors.pop("generator"))
         tensors = {name: value.to(device) for name, value in tensors.items()}
         backdrop = scalars.get("backdrop")
-        splats = Splats.of(_under("splats.", tensors), backdrop and Backdrop.of(backdrop))
+        splats = Splats.from_parameters(
+            _under("splats.", tensors), backdrop and Backdrop.from_numbers(backdrop))
         state = TrainState(
             SplatOptimizer(splats, config, means_unit, backend=backend),
             DensificationStats(**_under("gathered.", tensors)), generator,
@@ -202,12 +203,12 @@ def _unreadable(path: Path, error: Exception) -> FormatError:
         hint=f"Run `recon {path.parent.name} --again`; it starts from the beginning.")
 
 
-def check_finite(tensors: dict[str, Tensor], what: str) -> None:
-    """Raises TrainingError, opening with `what`, unless every value is finite."""
+def check_finite(tensors: dict[str, Tensor], where: str) -> None:
+    """Raises TrainingError, opening with `where`, unless every value is finite."""
     for name, value in tensors.items():
         if value.is_floating_point() and not torch.isfinite(value).all():
             raise TrainingError(
-                f"{what}: {name} holds values that are not finite.",
+                f"{where}: {name} holds values that are not finite.",
                 hint="Run the stage again with --again; if it recurs, lower the learning rates.")
 
 

@@ -1,4 +1,4 @@
-"""One optimization step: some views' gradients, their mean, and what follows from it."""
+"""One optimization step: some views' gradients, their mean, and its effects."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Stepper:
     def _look(
         self, view: TrainView, index: int, place: int, result: _BatchResult, iteration: int
     ) -> Statistics | None:
-        """Leaves the gradients of one view; None where they are no part of the step."""
+        """Leaves the gradients of one view; None where they are not part of the step."""
         state, importance = self._state, self._importance
         schedule = self._task.schedule
         degree = schedule.sh_degree(iteration)

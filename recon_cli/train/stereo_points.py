@@ -17,7 +17,7 @@ from recon_cli.io.images import reduce_view
 from recon_cli.progress import Progress
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import Photo, find_depths, find_partners, places
+from recon_cli.stereo.depths import StereoView, find_depths, find_partners, places
 from recon_cli.train.exposure import estimate_gains
 
 _VIEWS = 60  # searched, evenly spread
@@ -56,7 +56,7 @@ class SurfacePoints:
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
-    """What structure from motion knows of the training views."""
+    """The cameras and points of structure from motion, of the training views."""
 
     points: NDArray[np.float64]  # [P, 3] world units
     seen: Sequence[NDArray[np.int64]]  # rows of the points that each view sees; empty: not known
@@ -98,8 +98,9 @@ def find_surfaces(
                       for every in (chosen, depths))
     seen = seen[told]
     gains = np.exp(estimate_gains(chosen, model.points).log_gains.mean(axis=1))
-    photos = [Photo(view, float(np.quantile(depth, _TAIL)), float(np.quantile(depth, 1 - _TAIL)),
-                    float(gain)) for view, depth, gain in zip(chosen, depths, gains, strict=True)]
+    photos = [
+        StereoView(view, float(np.quantile(depth, _TAIL)), float(np.quantile(depth, 1 - _TAIL)),
+                   float(gain)) for view, depth, gain in zip(chosen, depths, gains, strict=True)]
     median = float(np.median(np.concatenate(depths)))
     some = np.random.default_rng(0).permutation(len(model.points))[:_SAMPLES]
     partners = find_partners(

@@ -1,4 +1,4 @@
-"""What is fitted: the views, at every size that a run asks for, and the plan."""
+"""The task of a fit: the views, at every size that a run asks for, and the plan."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from recon_cli.train.stereo_points import StereoPoints
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is fitted and by which plan."""
+    """The views to fit and the plan."""
 
     train: list[TrainView]  # views that gradients come from
     validation: list[TrainView]  # views that are only looked at

@@ -71,7 +71,7 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
 
 
 def _sparse_model(scene: Scene, names: Sequence[str]) -> SparseModel:
-    """Returns what is known of the views of these names."""
+    """Returns the records of the views of these names."""
     seen = {} if scene.sparse is None else read_visibility(scene.sparse)
     nothing = np.empty(0, np.int64)
     return SparseModel(scene.points, [seen.get(name, nothing) for name in names])
@@ -81,8 +81,8 @@ def _refuse_tiny_units(scene: Scene) -> None:
     """Raises TrainingError where half of the scene lies in front of the rasterizer's near plane."""
     if scene.nearness < NEAR:
         raise TrainingError(
-            f"Half of the points are nearer than {scene.nearness:.2g} units to a camera, and what "
-            f"is nearer than {NEAR:g} is not drawn: the units of this scene are too large.",
+            f"Half of the points are nearer than {scene.nearness:.2g} units to a camera, but "
+            f"Gaussians nearer than {NEAR:g} are not drawn: the units of this scene are too large.",
             hint="Give it a scale with `recon sfm --scale-between A B METRES`, or scale the poses "
             "of the data set.")
 
@@ -112,7 +112,7 @@ def read_config(folder: Path) -> RunConfig:
     """Returns the options that `write_config` wrote.
 
     Raises:
-        FormatError: a version before this one wrote a value that is no longer known.
+        FormatError: a version before this one wrote a value that this one does not know.
     """
     path = folder / "config.json"
     values = read_json(path, dict, hint="Run `recon train --again`.")
@@ -183,7 +183,7 @@ def gaussians_within(one: MemoryEstimate, free: int) -> int:
 def refuse_what_does_not_fit(
     needed: MemoryEstimate, free: int, *, limited: bool = False
 ) -> None:
-    """Raises TrainingError, saying what to lower, unless the estimate fits into `free` bytes.
+    """Raises TrainingError, naming an option to lower, unless the estimate fits into `free` bytes.
 
     `limited` says that more are free, but not to be used.
     """

@@ -1,1 +1,1 @@
-"""Where a scene can be trusted: what each Gaussian is seen from, and the error to expect."""
+"""Where a scene can be trusted: the views of each Gaussian, and the error to expect."""

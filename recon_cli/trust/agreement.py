@@ -53,7 +53,7 @@ class Reliability:
 
 def reliability(errors: Sequence[Array], expected: Sequence[Array]) -> Reliability:
     """Returns the reliability over all pixels of some views, [P] each."""
-    real, thought = np.concatenate(errors), np.concatenate(expected)
-    bins = np.array_split(np.argsort(thought, kind="stable"), BINS)
-    return Reliability(tuple(float(thought[rows].mean()) for rows in bins),
-                       tuple(float(real[rows].mean()) for rows in bins))
+    actual_error, expected_error = np.concatenate(errors), np.concatenate(expected)
+    bins = np.array_split(np.argsort(expected_error, kind="stable"), BINS)
+    return Reliability(tuple(float(expected_error[rows].mean()) for rows in bins),
+                       tuple(float(actual_error[rows].mean()) for rows in bins))

@@ -1,4 +1,4 @@
-"""What `recon eval` finds out about trust: measured, checked, drawn, and what is poorly seen."""
+"""Trust in `recon eval`: measured, checked and drawn, with the poorly seen regions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from recon_cli.workspace.summaries import WorldSummary
 
 @dataclass(frozen=True, eq=False)
 class TrustTask:
-    """What is assessed, and on which views."""
+    """The models to assess, and the views."""
 
     model: str  # base, or pruned where that is what export takes
     folder: Path  # of its stage
@@ -75,7 +75,7 @@ def assess(task: TrustTask, out: Path, ctx: StageContext) -> TrustRecord:
 def _saver(
     folder: Path, advance: Callable[[], None]
 ) -> Callable[[ReferenceView, NDArray[np.float32]], None]:
-    """Returns what writes the heat map of a view."""
+    """Returns the function that writes the heat map of a view."""
     folder.mkdir(exist_ok=True)
 
     def save(view: ReferenceView, expected: NDArray[np.float32]) -> None:

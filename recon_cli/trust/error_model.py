@@ -1,4 +1,4 @@
-"""From what a pixel's Gaussians rest on to the error to expect there: a small monotone model.
+"""From the support of a pixel's Gaussians to the error to expect there: a small monotone model.
 
 log E = bias + sum of weight x term, every weight at least 0, so that fewer views, a wider angle, a
 larger residual or a hole never lower the expected error. Fitted to the absolute errors of the
@@ -90,7 +90,7 @@ def _shape_terms(
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A view with what the expected error follows from."""
+    """A view with the terms of the expected error."""
 
     rgb: NDArray[np.float32]  # [H, W, 3] on the backdrop, not clamped
     alpha: NDArray[np.float32]  # [H, W]

@@ -20,7 +20,7 @@ def error_steps(expected: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 
 def heat_colors(expected: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Returns colours [..., 3] of expected errors [...]: blue is trusted, red is invented."""
+    """Returns colours [..., 3] of expected errors [...]: blue is trusted, red is unreliable."""
     share = np.log(np.maximum(expected, 1e-6) / TRUSTED) / np.log(INVENTED / TRUSTED)
     level = _BLUE + (_RED - _BLUE) * np.clip(share, 0, 1)
     steps = np.rint(255 * level).astype(np.uint8).reshape(1, -1)
@@ -35,6 +35,6 @@ def tint(colors: NDArray[np.uint8], expected: NDArray[np.float32]) -> NDArray[np
 
 
 def legend_stops() -> list[str]:
-    """Returns CSS colours from trusted to invented, evenly spread."""
+    """Returns CSS colours from trusted to unreliable, evenly spread."""
     errors = np.geomspace(TRUSTED, INVENTED, 9, dtype=np.float32)
     return [f"rgb({r},{g},{b})" for r, g, b in heat_colors(errors).tolist()]

@@ -1,4 +1,4 @@
-"""Trust as a property of each Gaussian in a .ply: one number, whatever it is seen from."""
+"""Trust as a property of each Gaussian in a .ply: one number for all directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trust of a model: what its Gaussians rest on, the calibrated errors, and both on disk."""
+"""The trust of a model: the support of its Gaussians, the calibrated errors, and both on disk."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Agreement(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class ModelTrust(JsonRecord):
-    """What trust.json says about one model."""
+    """The record of one model in trust.json."""
 
     views: int  # training views that were looked at
     error: ErrorModel
@@ -66,7 +66,7 @@ class TrustRecord(JsonRecord):
     models: tuple[str, ...]
     base: ModelTrust | None = None
     pruned: ModelTrust | None = None
-    reason: str = ""  # why there is no trust; empty where there is
+    reason: str = ""  # why it was not measured; empty where it was
     metres: bool = False  # world units are metres
     poorly_seen: tuple[PoorlySeenRegion, ...] = ()  # of the model that export takes
 
@@ -84,8 +84,8 @@ class TrustRecord(JsonRecord):
         """Writes the record into evaluate's folder."""
         write_json(evaluate / FOLDER / RECORD, self.to_json())
 
-    def of(self, model: str) -> ModelTrust | None:
-        """Returns what is said about base or pruned."""
+    def model_trust(self, model: str) -> ModelTrust | None:
+        """Returns the record of base or pruned."""
         return {"base": self.base, "pruned": self.pruned}[model]
 
     @property
@@ -116,8 +116,8 @@ class Trust:
         return self.error.expect(picture.terms)
 
     def describe_pictures(self) -> dict[str, Any]:
-        """Returns what a 16-bit picture of it means, for readers and as its fingerprint."""
-        return {"unit": "expected mean absolute error of the channels, whole range = 1",
+        """Returns the meaning of a 16-bit picture of it, for readers and as its fingerprint."""
+        return {"unit": "expected mean absolute error of the channels, full range = 1",
                 "error_per_step": 1 / FULL, "views": len(self.support.rows),
                 "model": self.error.to_json()}
 
@@ -133,7 +133,7 @@ class Trust:
             record = TrustRecord.read(evaluate)
         except ManifestError:  # of another version
             return None
-        stored = record and record.of(model)
+        stored = record and record.model_trust(model)
         if not stored:
             return None
         support = Support.load(evaluate / FOLDER / f"{model}.safetensors")
@@ -205,12 +205,12 @@ def model_trust(
     gains: bool, backend: str,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _error: None,
 ) -> ModelTrust:
-    """Returns what is known about a model's trust, checked on views that did not calibrate it.
+    """Returns the record of a model's trust, checked on views that did not calibrate it.
 
     `on_view` gets each of the `views` and its expected error [H, W].
     """
     areas: list[tuple[float, ...]] = []
-    real, thought = [], []
+    actual_error, expected_error = [], []
     for view in views:
         picture = picture_terms(
             splats, trust.support, view.camera, sh_degree=trust.sh_degree, backend=backend)
@@ -223,11 +223,11 @@ def model_trust(
         areas.append((ause(errors, own), *(
             ause(errors, np.asarray(image[used][pixels], np.float64))
             for image in (1 - picture.alpha, picture.depth))))
-        real.append(errors)
-        thought.append(own)
+        actual_error.append(errors)
+        expected_error.append(own)
     agreement = None
     if views:
-        bins, means = reliability(real, thought), np.mean(areas, axis=0)
+        bins, means = reliability(actual_error, expected_error), np.mean(areas, axis=0)
         agreement = Agreement(
             views=len(views), ause=round(float(means[0]), 4),
             ause_opacity=round(float(means[1]), 4), ause_depth=round(float(means[2]), 4),

@@ -1,4 +1,4 @@
-"""What each Gaussian rests on: the training views that show it, from where, and how well.
+"""The support of each Gaussian: the training views that show it, from where, and how well.
 
 One forward pass over the training views; held-out and validation views take no part.
 """
@@ -42,7 +42,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """What the training views show of N Gaussians."""
+    """The support of N Gaussians in the training views."""
 
     rows: tuple[Tensor, ...]  # by view the Gaussians that it shows, [K] int64
     centers: NDArray[np.float64]  # [V, 3] of these views, world units
@@ -51,7 +51,7 @@ class Support:
     digest: str = ""  # of the Gaussians
 
     @staticmethod
-    def of(
+    def from_rows(
         rows: Sequence[Tensor], centers: NDArray[np.float64], residual: Tensor, digest: str = ""
     ) -> Support:
         """Returns the support by `rows`, with the views of each Gaussian counted."""
@@ -94,7 +94,7 @@ class Support:
                      torch.where(torch.isinf(nearest), torch.zeros_like(nearer), nearer))
 
     def save(self, path: Path) -> None:
-        """Writes the support as safetensors, whole or not at all."""
+        """Writes the support as safetensors, atomically."""
         shown = np.zeros((len(self.rows), len(self.residual)), bool)
         for row, rows in zip(shown, self.rows, strict=True):
             row[rows.cpu().numpy()] = True
@@ -107,7 +107,7 @@ class Support:
 
     @staticmethod
     def load(path: Path) -> Support:
-        """Returns what `save` wrote; FormatError if the file is missing, damaged or of another."""
+        """Reads the file that `save` wrote; FormatError if it is missing, damaged or of another."""
         refuse_special(path)
         try:
             with safe_open(path, framework="pt") as file:
@@ -122,7 +122,7 @@ class Support:
             raise FormatError(
                 f"{path} cannot be read: {error}.", hint="Run `recon eval --again`.") from error
         rows = tuple(torch.from_numpy(np.nonzero(row)[0]) for row in bits)
-        return Support.of(rows, centers.numpy(), residual, str(head["digest"]))
+        return Support.from_rows(rows, centers.numpy(), residual, str(head["digest"]))
 
 
 def _directions(means: Tensor, place: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
@@ -137,7 +137,7 @@ def measure_support(
     gains: bool = False, on_view: Callable[[], None] = lambda: None,
     digest: str = "",
 ) -> Support:
-    """Returns what training views show of the Gaussians, by one forward pass over them.
+    """Returns the support of the Gaussians in the training views, by one forward pass over them.
 
     `gains` compares after the best gain per channel, as where exposures were trained.
     """
@@ -167,7 +167,7 @@ def measure_support(
         on_view()
     mean = float(errors.sum() / weights.sum().clamp_min(1e-12))
     residual = torch.where(weights > 0, errors / weights.clamp_min(1e-12), mean)
-    return Support.of(
+    return Support.from_rows(
         shown, np.reshape(centers, (-1, 3)), residual.to(splats.means.dtype), digest)
 
 

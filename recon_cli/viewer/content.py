@@ -73,7 +73,7 @@ class ViewerContent:
     views: tuple[LabeledView, ...]  # held-out first; none for a file or an import without views
     up: NDArray[np.float64] | None  # [3] unit vector; None where unknown
     start: BrowserCamera
-    distance: float  # from a camera to what it looks at, world units
+    distance: float  # from a camera to its target, world units
     max_size: int  # longest side that views are rendered at, in pixels
     metres: bool = False  # one world unit is a metre
 

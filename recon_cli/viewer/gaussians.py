@@ -64,7 +64,7 @@ def pack_splats(splats: Splats) -> PackedSplats:
 
 
 def show_backdrop(scene: viser.SceneApi, splats: Splats) -> None:
-    """Colours what browsers draw behind all Gaussians; black without a backdrop."""
+    """Sets the colour behind all Gaussians in browsers; black without a backdrop."""
     pixel = _eight_bit(splats.background.detach().cpu().numpy())
     scene.set_background_image(pixel.reshape(1, 1, 3), format="png")
 

@@ -46,7 +46,7 @@ def polygon_area(points: NDArray[np.float64]) -> float:
 
 
 def describe_points(points: NDArray[np.float64], scale: float | None) -> str:
-    """Returns what clicked points [P, 3] measure, for people.
+    """Returns the distances or angle of clicked points [P, 3] in words.
 
     `scale` is metres in one world unit, None where it is not known: nothing is called a metre then.
     """

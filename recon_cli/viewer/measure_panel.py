@@ -13,7 +13,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.viewer.measure import describe_points, locate_click, scale_command, scale_of
 
 _COLOR = (255, 60, 60)
-_POINT = 0.004  # of the distance to what is looked at
+_POINT = 0.004  # of the distance to the target of the camera
 
 
 class MeasurePanel:

@@ -43,7 +43,7 @@ def start_server(host: str, port: int | None, *, label: str) -> Iterator[tuple[S
     ConfigError if the port is in use, or the address is not of this machine.
     """
     chosen = _free_port(host, port)
-    # viser prints to stdout; the commands print what a user has to know
+    # viser prints to stdout; the commands inform the user
     rich.get_console().quiet = True
     with refusing_strangers(host):
         server = Server(host, chosen, label=label, verbose=False)

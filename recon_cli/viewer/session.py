@@ -12,6 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ReconError
 from recon_cli.scene.splats import quaternion
 from recon_cli.viewer.content import (
@@ -29,13 +30,13 @@ from recon_cli.viewer.gaussians import PackedSplats, show_backdrop
 from recon_cli.viewer.measure_panel import MeasurePanel
 from recon_cli.viewer.trust_tint import TrustTint
 
-_FRUSTUM_SIZE = 0.03  # of the distance to what is looked at
+_FRUSTUM_SIZE = 0.03  # of the distance to the target of the camera
 _HELD_OUT_COLOR, _FRUSTUM_COLOR = (255, 140, 40), (150, 170, 200)
 NO_VIEW = "none"
 UPS = {"+z": (0, 0, 1), "-y": (0, -1, 0), "+y": (0, 1, 0), "-z": (0, 0, -1), "+x": (1, 0, 0),
        "-x": (-1, 0, 0)}  # recon's own first, then COLMAP's usual one
 _REST_SECONDS = 0.25  # a camera that has not moved for this long has stopped
-_MOVED = 1e-3  # of the distance to what is looked at; smaller moves keep the colours
+_MOVED = 1e-3  # of the distance to the camera's target; smaller moves keep the colours
 _BOX_COLOR = (255, 170, 0)
 
 logger = logging.getLogger("recon")
@@ -101,8 +102,9 @@ class Session:
         self._count = gui.add_markdown(self._count_text())
         models = list(self._content.models)
         if len(models) > 1:
-            model = gui.add_dropdown("Model", models, initial_value=self._model)
-            model.on_update(lambda _: self._set_model(model.value))
+            labels = {MODEL_LABELS.get(name, name): name for name in models}
+            model = gui.add_dropdown("Model", list(labels), initial_value=self._label)
+            model.on_update(lambda _: self._set_model(labels[model.value]))
         if self._content.up is None:
             up = gui.add_dropdown("Up", list(UPS), hint="The axis of the file that points up.")
             up.on_update(lambda _: self._client.scene.set_up_direction(UPS[up.value]))
@@ -111,7 +113,7 @@ class Session:
         if self._trust is not None:
             self._tint = gui.add_checkbox(
                 "Trust", False, hint="Tints the scene by the error to expect from where you stand: "
-                "blue is trusted, red is invented.")
+    "blue is trusted, red is unreliable.")
             self._tint.on_update(lambda _: self._set_tint())
         self._add_crop()
         self._measure = MeasurePanel(
@@ -160,7 +162,7 @@ class Session:
 
     def _count_text(self) -> str:
         total = len(self._packed.splats)
-        return f"**{len(self._rows):,}** of {total:,} Gaussians ({self._model})"
+        return f"**{len(self._rows):,}** of {total:,} Gaussians ({self._label})"
 
     def _set_tint(self) -> None:
         """Turns the tint on once the trust of the model is known, or off."""
@@ -176,6 +178,11 @@ class Session:
                     self._refresh()
 
         self._submit(show)
+
+    @property
+    def _label(self) -> str:
+        """The name of the model that is shown, for the user."""
+        return MODEL_LABELS.get(self._model, self._model)
 
     def _set_model(self, name: str) -> None:
         with self._lock:

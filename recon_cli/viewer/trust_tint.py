@@ -18,7 +18,7 @@ from recon_cli.viewer.gaussians import PackedSplats, finite_rows
 
 
 class TrustTint:
-    """Tints the models of a workspace; what recon eval did not measure is measured when asked."""
+    """Tints the models of a workspace; those that `recon eval` left out follow on demand."""
 
     def __init__(self, job: Job) -> None:
         self._job = job

@@ -26,8 +26,8 @@ _Answer = Callable[[ServerConnection, Request], Response | None]
 def find_refusal(host: str, hosts: list[str], origins: list[str]) -> str:
     """Returns why a request is refused, empty if it is not.
 
-    `host` is what the server listens on; the others are the values of the request's headers. No
-    Origin is sent by programs that are no browser.
+    `host` is the address of the server; the others are the values of the request's headers. No
+    Origin is sent by programs that are not browsers.
     """
     if len(hosts) != 1 or not _is_own(urlsplit(f"//{hosts[0]}").hostname or "", host):
         return ("This address is not one of this machine. Open the one that recon printed, or the "

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: written beside, flushed, then renamed into place.
+"""Files that are either complete or absent: written beside, flushed, then renamed into place.
 
 Of unfinished work each gets a digest as well, see `journal`. Here is also the one reader of JSON.
 """
@@ -30,7 +30,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     It is flushed before the rename, so that a crash leaves the old file or the new one.
     """
-    # shortened, so that it is no longer than a name may be
+    # shortened to the length that a name may have
     temporary = path.with_name(f".{path.name[:_NAME]}.tmp{os.getpid()}{path.suffix}")
     try:
         yield temporary
@@ -49,7 +49,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def _share(path: Path) -> None:
     """Gives a file that only its owner may read the permissions of any new file.
 
-    Some libraries (safetensors) write private files whatever the umask says.
+    Some libraries (safetensors) write private files, against the umask.
     """
     if stat.S_IMODE(path.stat().st_mode) & 0o077:
         return
@@ -72,25 +72,25 @@ def delete(path: Path) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Writes `data` to `path`, whole or not at all."""
+    """Writes `data` to `path` atomically."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes text as UTF-8, whole or not at all; file names in it need not be UTF-8."""
+    """Writes text as UTF-8, atomically; file names in it need not be UTF-8."""
     write_bytes(path, text.encode(errors="replace"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` to `path` as readable JSON, whole or not at all. NaN is refused."""
+    """Writes `value` to `path` as readable JSON, atomically. NaN is refused."""
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_json(
     path: Path, kind: type | None = None, *, hint: str = "", finite: bool = True
 ) -> Any:
-    """Returns what a JSON file holds: a value of a `kind` (dict or list), if that is given.
+    """Returns the value in a JSON file, of a `kind` (dict or list) if that is given.
 
     NaN and infinity are refused unless `finite` is off, for readers that say where they stand.
 
@@ -142,7 +142,7 @@ def read_text(path: Path) -> str:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no plain file, too large, or not UTF-8.
+        ValueError: it is not a plain file, too large, or not UTF-8.
     """
     return read_bytes(path, most=MAX_TEXT_BYTES).decode("utf-8")
 
@@ -152,7 +152,7 @@ def read_bytes(path: Path, *, most: int | None = None) -> bytes:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no plain file, or too large.
+        ValueError: it is not a plain file, or too large.
     """
     special = describe_special(path)  # before it is opened: a FIFO would wait for its writer
     if special:
@@ -167,7 +167,7 @@ def read_bytes(path: Path, *, most: int | None = None) -> bytes:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Deletes what was begun in a folder, and below it, when a process was killed."""
+    """Deletes the unfinished files that a killed process left in and below a folder."""
     for path in folder.rglob(LEFTOVERS):
         if path.is_symlink() or not path.is_dir():
             path.unlink()

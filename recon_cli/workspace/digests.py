@@ -1,4 +1,4 @@
-"""What files hold, as SHA-256. Size and modification time vouch for a digest that is known."""
+"""SHA-256 digests of files. A known digest is valid for the same size and modification time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recon_cli.workspace.paths import refuse_special
 
 @dataclass(frozen=True)
 class FileDigest:
-    """What a file held when it was last read, and how to tell that it is still that file."""
+    """The digest of a file when it was last read, and the signs that it has not changed."""
 
     sha256: str
     size: int  # bytes
@@ -32,14 +32,14 @@ class Source:
     files: Mapping[str, FileDigest]
 
     def contents(self) -> list[str]:
-        """Returns what a fingerprint takes of it: digests in order, and names below a folder."""
+        """Returns its part of a fingerprint: digests in order, and names below a folder."""
         if len(self.files) == 1:
             return [file.sha256 for file in self.files.values()]
         return [f"{name} {file.sha256}" for name, file in self.files.items()]
 
 
 def sha256_json(value: Any) -> str:
-    """Returns the SHA-256 of a JSON value, whatever the order of its keys."""
+    """Returns the SHA-256 of a JSON value, with its keys in any order."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -55,7 +55,7 @@ def digest_file(path: Path, known: FileDigest | None = None) -> FileDigest:
 
 
 def read_source(path: Path, *, known: Source | None = None, without: Path) -> Source:
-    """Returns what a file, or every file below a folder, holds.
+    """Returns the digest of a file, or of every file below a folder.
 
     Hidden files are skipped, as is `without`, the workspace, which may lie beside the photos.
     `known`, an earlier reading, saves time.

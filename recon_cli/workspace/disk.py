@@ -54,7 +54,7 @@ def refuse_full_disk(folder: Path) -> None:
 
 
 def explain(error: BaseException, root: Path, doing: str) -> ReconError | None:
-    """Returns the error that says what has no space while `doing`; None where it is another one."""
+    """Returns the error of a full disk while `doing`; None for any other error."""
     number = find_space_errno(error)
     if number in _FULL:
         place = _fullest(root)
@@ -73,7 +73,7 @@ def explain(error: BaseException, root: Path, doing: str) -> ReconError | None:
 
 
 def explain_outside(error: BaseException) -> ReconError | None:
-    """Returns the error for what is wrong with a path or the system; None for any other."""
+    """Returns the error for a fault of a path or the system; None for any other."""
     if not isinstance(error, OSError) or error.errno not in _OUTSIDE or error.filename is None:
         return None
     return WorkspaceError(
@@ -82,7 +82,7 @@ def explain_outside(error: BaseException) -> ReconError | None:
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
-    """Yields an error, what led to it, and so on."""
+    """Yields an error, its cause, and so on."""
     at: BaseException | None = error
     while at is not None:
         yield at

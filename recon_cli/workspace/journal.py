@@ -1,10 +1,10 @@
-"""Digests of unfinished work, so that a run goes on from no file that was damaged meanwhile.
+"""Digests of unfinished work, so that a run does not continue from a damaged file.
 
 `.partial/<stage>.digests` lies beside the folder that a stage writes in. Before a file is put in
 place there, a line with its size and CRC-32 is added, and one without when it is there. A crash at
 any moment leaves each file as one of the last two lines of its name say, or not there yet. CRC-32
-takes a third of the time of SHA-256, and damage is no attack. Jobs that a stage shares out work in
-folders below `jobs`, perhaps on other machines, and keep digests of their own there.
+takes a third of the time of SHA-256, and damage is not an attack. Jobs that a stage shares out work
+in folders below `jobs`, perhaps on other machines, and keep digests of their own there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from recon_cli.workspace import durable
 from recon_cli.workspace.paths import is_plain_file
 
-PARTIAL = ".partial"  # the folder, in a workspace, of what is not finished
+PARTIAL = ".partial"  # the folder of unfinished work in a workspace
 SUFFIX = ".digests"
 JOBS = "jobs"  # the folder, in that of a stage, of jobs that it shares out
 _CHUNK = 1 << 20  # bytes
@@ -56,12 +56,12 @@ def journal_path(folder: Path) -> Path:
 
 
 def start(folder: Path) -> None:
-    """Begins to keep digests of what is written below a folder of unfinished work."""
+    """Begins to keep digests of the files below a folder of unfinished work."""
     journal_path(folder).write_bytes(b"")
 
 
 def expect(path: Path, temporary: Path) -> None:
-    """Records that `path` is about to hold what `temporary` does, if digests are kept there."""
+    """Records that `path` is about to get the content of `temporary`, if digests are kept there."""
     place = _find(path)
     if place:
         size = temporary.stat().st_size
@@ -83,7 +83,7 @@ def expect_removal(path: Path) -> None:
 
 
 def expect_growth(path: Path) -> None:
-    """Records what `path` holds now; what is appended to it later does not count."""
+    """Records the content of `path` now; lines appended to it later do not count."""
     place = _find(path)
     if place:
         durable.flush(path)
@@ -92,9 +92,9 @@ def expect_growth(path: Path) -> None:
 
 
 def find_damage(folder: Path) -> str:
-    """Returns in words what is damaged in unfinished work; empty if a run can go on from it.
+    """Describes the damage of unfinished work; empty if a run can continue it.
 
-    What has no digest was not finished, and is deleted, as is what was appended to a file since.
+    Files without a digest were not finished and are deleted, as are bytes appended to a file since.
     """
     journal = journal_path(folder)
     try:
@@ -137,7 +137,7 @@ def crc32(path: Path, size: int | None = None) -> int:
 
 
 def _restore(path: Path, state: _State) -> bool:
-    """Returns whether a file is in a state; what was appended since is cut off."""
+    """Returns whether a file is in a state; bytes appended since are cut off."""
     if state.size is None or path.is_symlink() or not path.is_file():
         return False
     size = path.stat().st_size

@@ -3,10 +3,10 @@
 A stage writes into `.partial/<stage>/`. When it is done, its files are flushed, its manifest is
 written last, and two renames put it in place: the old result to `.old/`, the new one to where the
 old one was. Killed between any two of these steps, the next writer finds either the old or the new
-result and completes what was begun.
+result and completes the swap.
 
-Whatever is deleted here may have been replaced by a link, to a larger disk for example: the link is
-removed, never what it points to.
+A folder to delete may have been replaced by a link, to a larger disk for example: the link is
+removed, never its target.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class Workspace:
         damaged since. A stage with `own_digests` finds that out by itself.
 
         Raises:
-            WorkspaceError: a folder that is no result has the name of the stage.
+            WorkspaceError: a folder that recon did not write has the name of the stage.
         """
         self._refuse_foreign(key.stage)
         partial, earlier = self.partial(key.stage), self.partial_run(key.stage)
@@ -137,7 +137,7 @@ class Workspace:
         return partial, fresh
 
     def _doubt(self, key: ResultKey, earlier: PartialRun | None, *, own_digests: bool) -> str:
-        """Returns why a run does not go on from unfinished work; empty if it does, or has none."""
+        """Returns why a run does not continue unfinished work; empty if it does, or has none."""
         partial = self.partial(key.stage)
         if earlier is None:
             return f"the record of it at {self._record(key.stage)} is missing or damaged" * (
@@ -162,7 +162,7 @@ class Workspace:
         remove(journal.journal_path(self.partial(stage)))
 
     def seal(self, stage: str, *, without: Collection[str] = ()) -> dict[str, FileDigest]:
-        """Flushes what a stage wrote and returns the digest of every file, by relative path.
+        """Flushes a stage's files and returns the digest of each, by relative path.
 
         Files `without` are in its folder, but not of its making.
         """
@@ -213,7 +213,7 @@ class Workspace:
         sync_folder(old.parent)
 
     def recover(self) -> None:
-        """Completes or undoes what a crash interrupted, stage by stage."""
+        """Completes or undoes work interrupted by a crash, stage by stage."""
         for name in (journal.PARTIAL, _OLD):
             path = self.root / name
             if (path.is_symlink() and name == _OLD) or (
@@ -224,11 +224,11 @@ class Workspace:
                 continue
             damage = find_changed_outputs(partial, Manifest.read(partial), ())
             if damage:
-                logger.warning("%s: what a crash interrupted was damaged since (%s), and is "
-                               "discarded", partial.name, "; ".join(damage))
+                logger.warning("%s: work interrupted by a crash was damaged since (%s), and "
+                               "is discarded", partial.name, "; ".join(damage))
                 self.discard(partial.name)
             else:
-                logger.info("%s: finishing what a crash interrupted", partial.name)
+                logger.info("%s: finishing work that a crash interrupted", partial.name)
                 self._swap(partial.name)
         for old in _folders(self.root / _OLD):
             if not self.folder(old.name).exists() and _complete(old):
@@ -239,14 +239,14 @@ class Workspace:
                 remove(old)
 
     def remove(self, stage: str) -> None:
-        """Removes a stage's result as a whole; raises WorkspaceError where the folder is none."""
+        """Removes a stage's result; raises WorkspaceError where the folder is none."""
         self._retire(stage)
         remove(self._old(stage))
 
     def scraps(self) -> list[Path]:
-        """Returns what no finished result needs: unfinished work, old results, blocks, seeds.
+        """Returns files that no finished result needs: unfinished work, old results, blocks, seeds.
 
-        Where one of these folders is a link, that is the link, not what it leads to.
+        Where one of these folders is a link, that is the link, not its target.
         """
         parents = [self.root / name for name in (journal.PARTIAL, _OLD, SEEDS, BLOCKS)]
         return [*(path for parent in parents
@@ -339,7 +339,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Renames a folder to where nothing is, also to another file system: whole or not at all."""
+    """Renames a folder to where nothing is, also to another file system, atomically."""
     try:
         durable.rename(source, target)
     except OSError as error:
@@ -383,7 +383,7 @@ def hold_lock(root: Path, verb: str, *, other: str = "another workspace with -w"
 
 
 def _name_holder(path: Path, verb: str) -> None:
-    """Writes who holds the lock. The lock is what counts, so a full disk does not matter here.
+    """Writes who holds the lock. Only the lock counts, so a full disk does not matter here.
 
     Nor does half a file of a process that was killed: the next one writes another.
     """

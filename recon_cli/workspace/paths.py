@@ -16,7 +16,7 @@ _KINDS = {
 
 
 def is_plain_file(path: Path) -> bool:
-    """Returns whether there is a file that is no link, which another process may have put there."""
+    """Returns whether a file exists and is not a link, which another process may have put there."""
     try:
         return stat.S_ISREG(os.lstat(path).st_mode)
     except OSError:
@@ -39,10 +39,10 @@ def refuse_special(path: Path) -> None:
     if kind:
         raise FormatError(
             f"{path} is {kind}, not a file.",
-            hint="Save what it gives to a file, and give the path of that.")
+            hint="Save its output to a file, and give the path of that file.")
 
 
 def describe_special(path: Path) -> str:
-    """Returns what a path is in words, empty for a file or a folder; OSError if it is not there."""
+    """Returns the kind of a path in words, empty for a file or folder; OSError if it is missing."""
     mode = os.stat(path).st_mode
     return next((kind for is_kind, kind in _KINDS.items() if is_kind(mode)), "")

@@ -133,7 +133,7 @@ class KnownPoses:
 
 
 def read_poses(path: Path) -> KnownPoses:
-    """Returns what `KnownPoses.write` wrote to poses.json; FormatError if a file is damaged."""
+    """Returns the poses that `KnownPoses.write` wrote; FormatError if a file is damaged."""
     value = atomic.read_json(path, dict, hint=AGAIN)
     try:
         viewmats = {
@@ -166,7 +166,7 @@ def choose_held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> 
 
 
 def prepare_frames_folder(stage: Path) -> Path:
-    """Creates the folder of frames in a stage's folder and clears what a killed run left."""
+    """Creates the folder of frames in a stage's folder and clears the rest of a killed run."""
     folder = stage / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     atomic.clear_leftovers(stage)
@@ -175,7 +175,7 @@ def prepare_frames_folder(stage: Path) -> Path:
 
 @dataclass(frozen=True)
 class ImportRecord(JsonRecord):
-    """What is known about an imported scene."""
+    """The record of an imported scene."""
 
     file: str  # name of the file that it was read from
     format: str  # of the file, by its name in `export_formats`

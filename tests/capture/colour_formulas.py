@@ -159,7 +159,7 @@ def eetf(light):
 
 
 def displayed(signals, transfer, primaries):
-    """What signals [N, 3] look like in sRGB, in units of 255; `transfer` 1 is SDR."""
+    """Signals [N, 3] in sRGB, in units of 255; `transfer` 1 is SDR."""
     if transfer not in (HLG, PQ):
         return 255 * (signals if primaries == 1 else srgb_encode(
             to_bt709(srgb_decode(signals), primaries)))

@@ -22,7 +22,7 @@ Entry = tuple[int, int, object]  # tag, type, values
 
 @dataclass(frozen=True)
 class Shot:
-    """What a camera writes beside the pixels.
+    """The metadata that a camera writes beside the pixels.
 
     Attributes:
         seconds: exposure time.

@@ -470,7 +470,7 @@ def test_whole_frames_are_those_of_the_undamaged_video(tmp_path, packet):
     scan = scan_video(path, threads=2, step=lambda: None)
     assert scan.lost > 0
     damaged = decode_pictures(path)
-    for picture, whole in zip(damaged, scan.whole, strict=True):
+    for picture, whole in zip(damaged, scan.intact, strict=True):
         if whole:
             np.testing.assert_array_equal(picture.rgb(), truth[picture.frame.pts])
     # A group of five, and one frame on either side.

@@ -13,7 +13,7 @@ from recon_cli.capture.raw_exposure import (
 
 
 def chain(ev, reach=2):
-    """What pairs of photos show of exposures, when they show them exactly."""
+    """Exposures as pairs of photos show them exactly."""
     return {
         (a, b): ev[b] - ev[a]
         for a in range(len(ev)) for b in range(a + 1, min(a + 1 + reach, len(ev)))}

@@ -55,7 +55,7 @@ def test_an_undamaged_video_is_whole(video):
     steps = []
     scan = scan_video(video, threads=2, step=lambda: steps.append(1))
     assert (scan.width, scan.height, scan.declared, len(steps)) == (160, 96, 40, 40)
-    assert (scan.lost, scan.expected, scan.whole.all()) == (0, 40, True)
+    assert (scan.lost, scan.expected, scan.intact.all()) == (0, 40, True)
     np.testing.assert_allclose(scan.seconds, np.arange(40) / 10)
     assert decode_threads(scan, 4) == 4
 
@@ -67,7 +67,7 @@ def test_a_container_without_a_count_is_checked_by_its_duration(tmp_path):
     path.write_bytes(data[:len(data) * 4 // 5])  # the first frame alone is half of it
     scan = scan_video(path, threads=1, step=quiet)
     assert scan.declared == pytest.approx(40, abs=1)
-    assert 3 <= scan.whole.sum() <= 37
+    assert 3 <= scan.intact.sum() <= 37
 
 
 def assert_equal(ours, theirs):
@@ -121,7 +121,7 @@ def test_whole_frames_are_exactly_those_of_the_undamaged_video(video, packet, er
     spoil_packets(video, [packet], erase=erase)
     scan = scan_video(video, threads=1, step=quiet)
     damaged = pixels()
-    for (pts, rgb), whole in zip(damaged.items(), scan.whole, strict=True):
+    for (pts, rgb), whole in zip(damaged.items(), scan.intact, strict=True):
         if whole:
             np.testing.assert_array_equal(rgb, truth[pts])
     # No more is given up than the group of ten that the packet belongs to.
@@ -171,7 +171,7 @@ def test_what_an_edit_list_leaves_out_is_not_lost(video, edits, shown, threads):
     whole = [picture.rgb() for picture in decode(video, threads=1)]
     set_edit_list(video, edits)
     scan = scan_video(video, threads=threads, step=quiet)
-    assert (scan.declared, len(scan.whole), scan.lost) == (len(shown), len(shown), 0)
+    assert (scan.declared, len(scan.intact), scan.lost) == (len(shown), len(shown), 0)
     for index, rgb in frames_at(video, range(len(shown)), threads=threads):
         np.testing.assert_array_equal(rgb, whole[shown[index]])
 
@@ -205,7 +205,7 @@ def test_places_of_an_avi_that_repeat_a_frame_are_not_lost(tmp_path, codec):
             container.mux(stream.encode(frame.reformat(format="yuv420p")))
         container.mux(stream.encode())
     scan = scan_video(path, threads=1, step=quiet)
-    assert (scan.declared, len(scan.whole), scan.lost) == (38, 38, 0)
+    assert (scan.declared, len(scan.intact), scan.lost) == (38, 38, 0)
     data = path.read_bytes()
     path.write_bytes(data[:len(data) * 2 // 3])  # without the index at its end
     assert scan_video(path, threads=1, step=quiet).lost > 0
@@ -216,7 +216,7 @@ def test_half_a_file_gives_the_frames_of_its_half(tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[:len(data) * 4 // 5])
     scan = scan_video(path, threads=1, step=quiet)
-    assert 3 <= scan.whole.sum() < 40
+    assert 3 <= scan.intact.sum() < 40
 
 
 def test_a_scan_is_of_the_upright_square_frame(tmp_path):

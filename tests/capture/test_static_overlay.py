@@ -1,4 +1,4 @@
-"""What is fixed to the camera is found where views move under it, and nowhere else."""
+"""Overlays are found where views move under them, and nowhere else."""
 
 import functools
 

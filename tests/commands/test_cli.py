@@ -46,7 +46,7 @@ def test_each_verb_runs_its_stage_and_says_what_came_of_it(capsys: Said) -> None
         assert main(words) == 0
     assert fake_stages.ran == NAMES
     out = capsys.readouterr().out
-    assert "train: steps 6, length 1.5, planned iterations 3,000 (" in out
+    assert "train (" in out
     assert "the table of evaluate" in out
     assert main(["train"]) == 0
     assert capsys.readouterr().out == "train is up to date\n"
@@ -144,7 +144,7 @@ def test_the_workspace_is_the_option_or_the_variable_or_a_folder_here(
                for name in ("workspace", "two", "three"))
 
 
-def test_status_shows_state_reason_and_summary(capsys: Said) -> None:
+def test_status_shows_state_and_reason(capsys: Said) -> None:
     main(["run", "room.mp4"])
     Path("workspace/recon.toml").write_text("[train]\niterations = 7\n")
     capsys.readouterr()
@@ -152,7 +152,6 @@ def test_status_shows_state_reason_and_summary(capsys: Said) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1 + len(NAMES)
     assert "fresh" in lines[1]
-    assert "steps 6, length 1.5" in lines[1]
     assert "train.iterations changed: automatic -> 7" in lines[4]
 
 
@@ -171,7 +170,7 @@ def test_status_as_json_has_stable_keys(capsys: Said) -> None:
 
 def test_status_needs_no_workspace_and_makes_none(capsys: Said) -> None:
     assert main(["status", "-w", "none"]) == 0
-    assert "there is no workspace" in capsys.readouterr().err
+    assert "no workspace at" in capsys.readouterr().err
     assert not Path("none").exists()
 
 

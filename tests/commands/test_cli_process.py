@@ -46,7 +46,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert process.stderr
     process.stdout.close()
     assert process.stderr.read() in (
-        "", f"notice: there is no workspace at {Path('workspace').absolute()} yet\n")
+        "", f"notice: no workspace at {Path('workspace').absolute()} yet\n")
     process.wait()
 
 

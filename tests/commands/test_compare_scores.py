@@ -97,7 +97,7 @@ def test_paths_of_one_name_are_told_apart_in_every_table(room, tmp_path, capsys)
     shutil.copytree(room / "b", twin)
     found = as_json(compared(capsys, room / "a", twin, "--form", "json"))
     labels = [one["label"] for one in found["models"]]
-    assert labels == [f"{room / 'a'}, base", f"{room / 'a'}, pruned", f"{twin}, base"]
+    assert labels == [f"{room / 'a'}, original", f"{room / 'a'}, compact", f"{twin}, original"]
     means = [line for line in compared(capsys, room / "a", twin, "--form", "csv").splitlines()
              if ",mean," in line]
     assert len(means) == 3

@@ -1,4 +1,4 @@
-"""What is said while a bar is drawn stands on a line of its own."""
+"""Messages during a progress bar stand on a line of their own."""
 
 import os
 import pty

@@ -35,7 +35,7 @@ EVERY_FIELD = [
 def parsed(config: type[StageConfig], *words: str) -> dict[str, object]:
     """Returns what a command with the options of `config` collects."""
     @click.command()
-    @options.of(config)
+    @options.config_options(config)
     def command() -> None:
         """Does nothing."""
 
@@ -163,7 +163,7 @@ def test_an_axis_may_begin_with_a_dash() -> None:
 
 def test_some_fields_can_be_left_out() -> None:
     @click.command()
-    @options.of(PruneConfig, without=("at",), lead="With --prune: ")
+    @options.config_options(PruneConfig, without=("at",), lead="With --prune: ")
     def command() -> None:
         """Does nothing."""
 

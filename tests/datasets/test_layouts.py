@@ -84,7 +84,7 @@ def test_photos_and_videos_have_no_layout(tmp_path):
     assert recognise(tmp_path) is None
     assert recognise(tmp_path / "photo.jpg") is None
     assert recognise(tmp_path / "gone") is None
-    with pytest.raises(InputError, match="no data set with poses") as caught:
+    with pytest.raises(InputError, match="not a data set with poses") as caught:
         read_posed(tmp_path)
     assert all(layout.needs in caught.value.hint for layout in LAYOUTS)
 
@@ -115,6 +115,6 @@ def test_a_folder_where_a_file_belongs_is_a_typed_error(tmp_path):
     ("rooms/office", "a Replica sequence (NICE-SLAM layout): 100 frames, 20 with depth, "
      "12 held-out views"),
     ("fox", "a transforms.json data set (nerfstudio, instant-ngp): 50 images, 17 images missing"),
-    ("desk_monitors", "a COLMAP model: 70 images, 21444 points")])
+    ("desk_monitors", "a COLMAP model: 70 images, 21,444 points")])
 def test_real_data_sets_are_described(shared_data, room, words):
     assert describe(read_posed(shared_data / room)) == words

@@ -89,8 +89,8 @@ def test_intrinsics_that_are_none_are_refused(tmp_path, more, said):
 
 @pytest.mark.parametrize(("matrix", "said"), [
     (np.full((4, 4), np.nan).tolist(), "not finite"),
-    ((2 * posed_sets.pose(2) @ posed_sets.OPENGL).tolist(), "no rigid pose"),
-    ([[1, 0], [0, 1]], "has 4 numbers"), ([], "has 0 numbers"), ("x", "no matrix")])
+    ((2 * posed_sets.pose(2) @ posed_sets.OPENGL).tolist(), "not a rigid pose"),
+    ([[1, 0], [0, 1]], "has 4 numbers"), ([], "has 0 numbers"), ("x", "not a matrix")])
 def test_a_frame_whose_pose_is_none_is_named(tmp_path, matrix, said):
     with pytest.raises(FormatError, match=rf"frame images/0002\.png.*{said}"):
         read(tmp_path, edited(transform_matrix=matrix))
@@ -109,7 +109,7 @@ def test_images_that_are_gone_are_missing_and_need_no_lens(tmp_path):
     posed = read_transforms(tmp_path)
     assert posed.missing == ("0001.png",)
     assert len(posed.images) == 3
-    assert "1 of the 4 images that it lists are missing, the first is 0001.png" in posed.notices
+    assert "missing: 1 of the 4 images that it lists, the first is 0001.png" in posed.notices
 
 
 def test_a_set_without_any_of_its_images_is_refused(tmp_path):
@@ -198,7 +198,7 @@ def test_an_image_listed_twice_with_one_pose_is_taken_once_and_said(tmp_path):
     rewrite(tmp_path, lambda value: value["frames"].append(value["frames"][1]))
     posed = read_transforms(tmp_path)
     assert len(posed.images) == 4
-    assert posed.notices == ("1 images are listed more than once, the first is images/0001.png",)
+    assert posed.notices == ("listed more than once: 1 image, the first is images/0001.png",)
 
 
 def test_an_image_with_two_poses_is_refused(tmp_path):

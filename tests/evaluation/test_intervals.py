@@ -8,10 +8,10 @@ from recon_cli.evaluation.intervals import Spread, paired_bootstrap, paired_t
 
 
 def test_a_spread_is_the_mean_and_the_deviation_of_a_sample():
-    found = Spread.of([2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0])
+    found = Spread.from_values([2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0])
     assert found.mean == 5.0
     assert found.deviation == pytest.approx((32 / 7) ** 0.5)
-    assert Spread.of([3.0]).deviation is None
+    assert Spread.from_values([3.0]).deviation is None
 
 
 def test_two_seeds_give_the_interval_of_the_cauchy_distribution():

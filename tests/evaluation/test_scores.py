@@ -24,9 +24,9 @@ def view(name, psnr_db, ssim, lpips=None):
 
 def scores():
     views = (view("a.png", 30.0, 0.9), view("b.png", 32.0, 0.8))
-    return {"3DGS": ModelMetrics.of(views, gaussians=1234, bytes=5_000_000, render_ms=12.0,
+    return {"3DGS": ModelMetrics.from_views(views, gaussians=1234, bytes=5_000_000, render_ms=12.0,
                                     train_seconds=60.0),
-            "ours": ModelMetrics.of(views, gaussians=600, bytes=2_000_000, render_ms=6.0)}
+            "ours": ModelMetrics.from_views(views, gaussians=600, bytes=2_000_000, render_ms=6.0)}
 
 
 def test_means_are_over_views():
@@ -38,8 +38,9 @@ def test_means_are_over_views():
 
 def test_lpips_has_no_mean_where_a_view_has_none():
     half, whole = (
-        ModelMetrics.of((view("a", 30, 0.9, 0.1), view("b", 30, 0.9, lpips)), gaussians=1, bytes=1,
-                        render_ms=1) for lpips in (None, 0.3))
+        ModelMetrics.from_views(
+            (view("a", 30, 0.9, 0.1), view("b", 30, 0.9, lpips)), gaussians=1, bytes=1,
+            render_ms=1) for lpips in (None, 0.3))
     assert half.lpips is None
     assert whole.lpips == pytest.approx(0.2)
     assert "LPIPS" in model_table({"x": half, "y": whole}).headings
@@ -81,7 +82,7 @@ def test_only_the_recipe_of_3dgs_is_the_reference(changes, expected):
 
 
 @pytest.mark.parametrize(("recipe", "labels"), [
-    (REFERENCE, ["3DGS", "pruned"]), (None, ["base", "pruned"])])
+    (REFERENCE, ["3DGS", "compact"]), (None, ["original", "compact"])])
 def test_tables_name_a_base_model_3dgs_only_where_it_was_trained_so(recipe, labels):
     named = dict(zip(("base", "pruned"), scores().values(), strict=True))
     metrics = Metrics(

@@ -116,6 +116,6 @@ def test_without_a_model_the_command_to_type_is_named(tmp_path, capsys):
 
 
 def test_one_seed_has_no_deviation():
-    assert Spread.of((2.0,)).deviation is None
-    assert Spread.of((1.0, 3.0)).deviation == pytest.approx(2**0.5)
-    assert Spread.of((2.0,)).text(".1f") == "2.0"
+    assert Spread.from_values((2.0,)).deviation is None
+    assert Spread.from_values((1.0, 3.0)).deviation == pytest.approx(2**0.5)
+    assert Spread.from_values((2.0,)).text(".1f") == "2.0"

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 @dataclass
 class Case:
-    """What a kind of fault is given."""
+    """The inputs of a kind of fault."""
 
     lab: Lab
     rng: random.Random

@@ -1,4 +1,4 @@
-"""What can be wrong with a file: damage to its bytes, its numbers, and what it is."""
+"""Faults of a file: damage to its bytes, its numbers, and its kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Full disks of random sizes: exit code 7, nothing finished lost, and the work goes on with space.
+"""Full disks of random sizes: exit code 7, nothing finished lost, and the work resumes with space.
 
 A small tmpfs in a mount namespace of its own where root may mount, else a limit on the size of
 files.

@@ -80,7 +80,7 @@ def preload() -> None:
 
 
 class Said:
-    """What a command prints: a pipe with room for all of it, which no full disk stops."""
+    """The output of a command: a pipe with room for all of it, which no full disk stops."""
 
     def __init__(self) -> None:
         self._source, self.target = os.pipe()

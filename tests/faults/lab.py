@@ -1,4 +1,4 @@
-"""What faults are injected into: a tiny finished workspace, unfinished ones, sound inputs."""
+"""The targets of faults: a tiny finished workspace, unfinished ones, sound inputs."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Gate:
         return bool(select.select([self._reached], [], [], limit)[0])
 
     def let_through(self) -> None:
-        """Lets the command go on, whether it waits already or not."""
+        """Lets the command continue, whether it waits already or not."""
         os.write(self._go, b"x")
 
     def close(self) -> None:

@@ -37,7 +37,7 @@ _READERS = {
 _SAYS = re.compile("stale|damaged|missing|unfinished|cannot|changed|not shown|is gone")
 
 
-# Stages by what they leave: sfm and train have most files that the next run goes on from.
+# Stages by what they leave: sfm and train have most files that the next run continues from.
 _LEFT = (*STAGES, "sfm", "sfm", "train", "prune", "ingest")
 
 
@@ -138,7 +138,7 @@ def _judge_status(case: Case, workspace: Path, name: Path, done: Finished) -> Ve
 
 
 def unfinished_file(case: Case) -> Verdict:
-    """One file that an interrupted stage left; the stage then goes on, or begins anew."""
+    """One file that an interrupted stage left; the stage then continues, or begins anew."""
     lab = case.lab
     stage, damage = case.pick([(one, each) for one in _LEFT for each in DAMAGES], stride=7919)
     names = case.draw(classes(lab.half(stage), below=".partial"))

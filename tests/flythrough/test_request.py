@@ -1,4 +1,4 @@
-"""What `recon render` refuses before it looks at a workspace."""
+"""Requests that `recon render` refuses before it looks at a workspace."""
 
 from pathlib import Path
 

@@ -39,16 +39,16 @@ def test_a_pruned_model_that_is_not_there_is_an_error_and_a_stale_one_is_left_ou
     assert "Run `recon prune -w " in capsys.readouterr().err
     (copied / "prune" / "splats.ply").write_bytes((copied / "train" / "splats.ply").read_bytes())
     assert render(copied, "--views", "000001", "--out", tmp_path / "out") == 0
-    assert "the pruned model is not used: it is stale" in caplog.text
+    assert "model is not used: it is stale" in caplog.text
     assert record(tmp_path / "out")["settings"]["model"] == "base"
 
 
 @pytest.mark.parametrize(("words", "said"), [
-    (["--views", "000099"], "no view '000099'"),
+    (["--views", "000099"], "views is named '000099'"),
     (["--views", "000001.pgn"], "Did you mean 000001.png?"),
     (["--path", "orbit", "--views", "test"], "exclude each other"),
-    (["--output", "rgb,normals"], "'rgb,normals' is no list"),
-    (["--background", "white"], "no colour such as"),
+    (["--output", "rgb,normals"], "'rgb,normals' is not a list"),
+    (["--background", "white"], "not a colour such as"),
     (["--size", "100000"], "MB to render"),
     (["--width", "321", "--format", "mp4"], "must be even"),
     (["--format", "mp4", "--width", "40000", "--height", "2"], "libx264 cannot encode"),

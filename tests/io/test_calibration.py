@@ -44,7 +44,7 @@ def test_a_rounded_rotation_is_made_orthonormal():
 def test_a_scaled_pose_is_refused_with_its_scale(angle, scale):
     scaled = np.eye(4)
     scaled[:3, :3] = scale * turn(angle)
-    with pytest.raises(FormatError, match=f"frame 7 is no rigid pose: scaled by {scale:.4g}"):
+    with pytest.raises(FormatError, match=f"frame 7 is not a rigid pose: scaled by {scale:.4g}"):
         viewmat_from_pose(scaled, "frame 7")
 
 
@@ -58,9 +58,9 @@ def test_a_reflection_and_a_shear_are_refused():
 
 
 @pytest.mark.parametrize(("value", "said"), [
-    (np.full((4, 4), np.nan), "not finite"), (np.eye(3), "9 numbers"), ("abc", "no matrix"),
-    ([[1, 2], [3]], "no matrix"), (None, "numbers"), (np.zeros((4, 4)), "last row"),
-    (np.diag([0.0, 0, 0, 1]), "no rigid pose")])
+    (np.full((4, 4), np.nan), "not finite"), (np.eye(3), "9 numbers"), ("abc", "not a matrix"),
+    ([[1, 2], [3]], "not a matrix"), (None, "numbers"), (np.zeros((4, 4)), "last row"),
+    (np.diag([0.0, 0, 0, 1]), "not a rigid pose")])
 def test_what_is_no_pose_is_refused(value, said):
     with pytest.raises(FormatError, match=said):
         viewmat_from_pose(value, "it")

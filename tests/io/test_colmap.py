@@ -135,7 +135,7 @@ def test_a_file_cut_short_anywhere_is_damaged(undistorted, name, share):
     path = undistorted / "sparse" / name
     data = path.read_bytes()
     path.write_bytes(data[:int(share * len(data))])
-    with pytest.raises(FormatError, match="not a whole COLMAP model"):
+    with pytest.raises(FormatError, match="not a complete COLMAP model"):
         read(undistorted)
 
 

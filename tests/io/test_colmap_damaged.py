@@ -43,7 +43,7 @@ def test_an_image_outside_the_data_set_is_refused(tmp_path):
 def test_a_binary_file_cut_short_anywhere_is_damaged(tmp_path, name, share):
     write(tmp_path, rig_model(), "bin")
     cut(tmp_path / "sparse" / "0" / f"{name}.bin", share)
-    with pytest.raises(FormatError, match="not a whole COLMAP model"):
+    with pytest.raises(FormatError, match="not a complete COLMAP model"):
         read_colmap(tmp_path)
 
 
@@ -53,7 +53,7 @@ def test_rigs_and_frames_cut_short_anywhere_are_damaged(tmp_path, name, share):
     write(tmp_path, rig_model(), "bin")
     (tmp_path / "sparse" / "0" / "images.bin").unlink()
     cut(tmp_path / "sparse" / "0" / f"{name}.bin", share)
-    with pytest.raises(FormatError, match="not a whole COLMAP model"):
+    with pytest.raises(FormatError, match="not a complete COLMAP model"):
         read_colmap(tmp_path)
 
 

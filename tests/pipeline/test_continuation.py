@@ -1,4 +1,4 @@
-"""When a training goes on from the finished one, and what that means for its results."""
+"""When a training continues the finished one, and how that changes its results."""
 
 from __future__ import annotations
 

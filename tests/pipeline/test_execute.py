@@ -1,4 +1,4 @@
-"""What later stages need is imported while a stage leaves a core idle."""
+"""The modules of later stages are imported while a stage leaves a core idle."""
 
 import dataclasses
 import sys
@@ -25,9 +25,9 @@ def rows(tmp_path, monkeypatch):
 
 def test_the_next_stage_that_renders_is_imported_in_a_thread(tmp_path, rows):
     job = dataclasses.replace(job_at(tmp_path), table=rows, asked=("sfm", "train", "prune"))
-    with importing_ahead(job) as on_idle:
+    with importing_ahead(job) as while_idle:
         assert "late_stage" not in sys.modules
-        on_idle()
+        while_idle()
     assert threading.get_ident() != sys.modules["late_stage"].THREAD
 
 
@@ -38,22 +38,22 @@ def test_kernels_are_loaded_where_they_are_compiled(tmp_path, rows, monkeypatch)
     monkeypatch.setattr(registry, "prepare", lambda name, _: prepared.append(name) or 0.0)
     for to_compile in (12, 0):
         monkeypatch.setattr(registry, "kernels_to_compile", lambda _, left=to_compile: left)
-        with importing_ahead(job) as on_idle:
-            on_idle()
+        with importing_ahead(job) as while_idle:
+            while_idle()
         assert prepared == ["numba"] * (to_compile == 0)
 
 
 @pytest.mark.parametrize("asked", [(), ("ingest", "sfm")])
 def test_nothing_is_imported_for_stages_that_do_not_render(tmp_path, rows, asked):
     job = dataclasses.replace(job_at(tmp_path), table=rows, asked=asked)
-    with importing_ahead(job) as on_idle:
-        on_idle()
+    with importing_ahead(job) as while_idle:
+        while_idle()
     assert "late_stage" not in sys.modules
 
 
 def test_what_cannot_be_imported_fails_where_it_is_needed(tmp_path, rows):
     (tmp_path / "late_stage.py").write_text("raise RuntimeError('half installed')")
     job = dataclasses.replace(job_at(tmp_path), table=rows, asked=("train",))
-    with importing_ahead(job) as on_idle:
-        on_idle()
+    with importing_ahead(job) as while_idle:
+        while_idle()
     assert "late_stage" not in sys.modules

@@ -1,4 +1,4 @@
-"""What is stale and why, and what an input that changed, moved or went makes of it."""
+"""Stale stages and their reasons, and the effect of inputs that changed, moved or went."""
 
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What runs and what does not, and that a killed run can be resumed."""
+"""Which stages run and which do not, and that a killed run can be resumed."""
 
 
 import errno

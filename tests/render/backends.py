@@ -159,7 +159,7 @@ def compared(
 
 @dataclass(frozen=True)
 class _Truth:
-    """What the oracle says of a scene: three images, the weights of a loss, its gradients."""
+    """The oracle's results for a scene: three images, the weights of a loss, its gradients."""
 
     images: list[Tensor]
     weights: list[Tensor]

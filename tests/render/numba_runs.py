@@ -32,7 +32,7 @@ HASWELL = {
 
 @dataclass(frozen=True)
 class Run:
-    """What a process left.
+    """The results of a process.
 
     Attributes:
         report: of numba_process.
@@ -86,7 +86,7 @@ def _copy_damaged(target: Path) -> None:
     backend.warm_up()
     source = kernel.cache_folder()
     if source is None:
-        pytest.skip("there is no place to keep compiled kernels, see RECON_CACHE_DIR")
+        pytest.skip("no folder for compiled kernels, see RECON_CACHE_DIR")
     shutil.copytree(source, target / "kernels" / source.name)
     files = [*target.rglob("*.nbc"), *target.rglob("*.nbi")]
     assert files

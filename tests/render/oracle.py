@@ -20,7 +20,7 @@ from recon_cli.scene.splats import Splats
 
 
 class Composite(NamedTuple):
-    """What the oracle knows of a picture.
+    """The oracle's results for a picture.
 
     Attributes:
         rgb: [H, W, 3], differentiable, like the next two.

@@ -9,11 +9,18 @@ from interpreter import DEVICE
 
 from recon_cli.errors import BackendError
 from recon_cli.render import self_check
-from recon_cli.render.self_check import Candidate, StepResult, Verdict, check, numba_candidate
+from recon_cli.render.self_check import (
+    BackendCandidate,
+    StepResult,
+    Verdict,
+    check,
+    numba_candidate,
+)
 
 CPU = torch.device("cpu")
 SIZE = {"count": 60, "width": 40, "height": 30}
-FAILED = Verdict("triton", "a GPU", "rgb, hard scene: error 7 times what is allowed", {}, 1.0)
+FAILED = Verdict(
+    "triton", "a GPU", "rgb, hard scene: error 7 times the allowed difference", {}, 1.0)
 PASSED = Verdict("triton", "a GPU", "", {"rgb, hard scene": 0.01}, 1.0)
 
 
@@ -39,7 +46,7 @@ def test_the_triton_kernels_pass():
 def faulty(render=None, step=None):
     """The numba backend with a fault in its render function or its training step."""
     good = numba_candidate()
-    return Candidate("fake", render(good.render) if render else good.render,
+    return BackendCandidate("fake", render(good.render) if render else good.render,
                      step(good.train_step) if step else good.train_step)
 
 

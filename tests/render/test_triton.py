@@ -1,4 +1,4 @@
-"""What is the triton backend's alone: its kernels compile for GPUs that are not here."""
+"""The triton backend alone: its kernels compile for GPUs that are not here."""
 
 import importlib.util
 import os

@@ -34,7 +34,7 @@ def sweep(workspace):
 
 def test_the_curve_has_every_score_the_control_and_both_models_marked(sweep):
     pruning = section(page_of(sweep()), "pruning")
-    for label in ("loo", "random", "no prune, as many steps", "base model", "pruned model"):
+    for label in ("loo", "random", "no prune, as many steps", "original model", "compact model"):
         assert f"</svg>{label}</li>" in pruning
     assert "<figcaption>PSNR on 2 validation views after 9 steps of recovery" in pruning
     assert "loo: Gaussians left 10, PSNR, dB 25</title>" in pruning

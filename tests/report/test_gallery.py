@@ -55,7 +55,7 @@ def test_what_a_mask_hides_has_no_colour():
 def write_metrics(folder, models):
     """Writes metrics.json of views with a name and a PSNR each, by model."""
     (folder / Metrics.FILE).write_text(json.dumps(Metrics(
-        models={model: ModelMetrics.of(
+        models={model: ModelMetrics.from_views(
             tuple(ViewScore(name, psnr_db, psnr_db, 0.9, 0.9) for name, psnr_db in views),
             gaussians=9, bytes=9, render_ms=1.0) for model, views in models.items()},
         psnr_convention="", psnr_8bit_convention="", ssim_convention="", ssim_padded_convention="",

@@ -134,7 +134,7 @@ def test_views_are_worst_first_for_the_model_that_is_shown(workspace, page):
     assert base == pruned[::-1]
     assert names(page) == base
     assert f"1 of 3: {base[0]}, PSNR 20.00 dB" in page.page.locator("#caption").inner_text()
-    page.page.get_by_text("pruned", exact=True).locator("visible=true").first.click()
+    page.page.get_by_text("compact", exact=True).locator("visible=true").first.click()
     assert names(page) == pruned
     assert "PSNR 30.00 dB" in page.page.locator("#caption").inner_text()  # the same view
     page.page.keyboard.press("m")

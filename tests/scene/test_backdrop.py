@@ -110,7 +110,7 @@ def test_parts_of_a_scene_get_one_for_all_cameras():
 
 
 def test_its_numbers_say_all_and_others_are_refused():
-    assert Backdrop.of(BACKDROP.numbers) == BACKDROP
+    assert Backdrop.from_numbers(BACKDROP.numbers) == BACKDROP
     for wrong in ([], [1.0] * 6, [1.0] * 8, [*BACKDROP.numbers[:6], float("nan")]):
         with pytest.raises(ValueError, match="no backdrop"):
-            Backdrop.of(wrong)
+            Backdrop.from_numbers(wrong)

@@ -14,7 +14,7 @@ from recon_cli.scene.splats import Splats
 
 
 def truth() -> Splats:
-    """What tiny_scene's views show, of degree 0."""
+    """The scene of tiny_scene's views, of degree 0."""
     found = random_splats(60, seed=0, dtype=torch.float32)
     found.means[:, 2] = 3 + 0.3 * found.means[:, 2]
     found.log_scales.clamp_(min=-2.0, max=-1.5)

@@ -1,4 +1,4 @@
-"""What sfm reads, made on the spot, and frames that defeat it."""
+"""Inputs of sfm, made on the spot, and frames that defeat it."""
 
 import av
 import cv2

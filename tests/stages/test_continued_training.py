@@ -1,4 +1,4 @@
-"""Training that goes on from a finished run: what it gains, keeps, records, and repeats."""
+"""Training that continues a finished run: gains, files kept, records and repeats."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def finished(inputs, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def continued(inputs, finished, tmp_path_factory):
-    """The folder of a run that went on to 320 steps, and its summary."""
+    """The folder of a run that was continued to 320 steps, and its summary."""
     out = tmp_path_factory.mktemp("continued")
     return out, go_on(LONG, inputs, finished, out)
 

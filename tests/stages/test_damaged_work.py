@@ -62,7 +62,7 @@ class Work:
     inputs: StageInputs
 
     def run(self, root: Path) -> Path:
-        """Runs the stage, or goes on with it, and returns the folder that it wrote."""
+        """Runs or resumes the stage, and returns the folder that it wrote."""
         workspace, key = Workspace(root), ResultKey(self.name, 1, {}, (), {})
         with workspace.writing(self.name):
             out, earlier = workspace.begin(key)

@@ -57,7 +57,7 @@ def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):
     assert metrics["models"]["base"]["psnr_db"] > mean_colour_psnr(inputs) + 2
     table = (out / "table.txt").read_text()
     assert "3DGS" not in table + (out / "metrics.tex").read_text()  # budget is another recipe
-    assert [line.split()[0] for line in table.splitlines()[2:4]] == ["base", "pruned"]
+    assert [line.split()[0] for line in table.splitlines()[2:4]] == ["original", "compact"]
     assert "scikit-image" in table
     assert "INRIA" in table
     assert "LPIPS: not measured" in table  # no test has its weights
@@ -66,7 +66,7 @@ def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):
         *(metrics["models"][name]["views"] for name in ("base", "pruned")), strict=True)]
     assert metrics["pruned_minus_base"]["psnr_db"]["mean"] == pytest.approx(np.mean(gained))
     assert min(gained) <= metrics["pruned_minus_base"]["psnr_db"]["low"] <= np.mean(gained)
-    assert "data set & PSNR base & PSNR pruned" in (out / "metrics.tex").read_text()
+    assert "data set & PSNR original & PSNR compact" in (out / "metrics.tex").read_text()
     assert len((out / "metrics.csv").read_text().splitlines()) == 1 + 2 * (VIEWS // 4 + 1)
 
 

@@ -83,7 +83,7 @@ def of_transforms(path):
 
 
 def pictures(splats, cameras):
-    """What the cameras see, by name."""
+    """The cameras' views, by name."""
     with torch.no_grad():
         return {name: render(splats, camera, splats.background, 3, backend="torch").rgb
                 for name, camera in cameras.items()}
@@ -116,7 +116,7 @@ def test_files_and_cameras_that_are_handed_out_show_the_same_pictures(inputs, op
 
 
 def test_harmonics_that_did_not_turn_would_be_seen(inputs):
-    """The bound above is only a bound if this fails it."""
+    """The bound above means nothing unless this exceeds it."""
     out, _ = exported(inputs, format="colmap", transform=flat(MOVED))
     before = pictures(read_ply(inputs.folders["train"] / "splats.ply"),
                       of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse"))
@@ -167,7 +167,7 @@ def test_where_up_was_not_found_the_cameras_say_it_and_this_is_said(inputs, name
 
 @pytest.mark.parametrize("name", [None, *AXES])
 def test_a_glb_has_y_up_whatever_is_up_in_the_scene(inputs, name):
-    """What is highest in the scene has the greatest y in the .glb."""
+    """The highest Gaussian of the scene has the greatest y in the .glb."""
     up_is_z(inputs)
     out, _ = exported(inputs, format="glb", up=name)
     data = (out / "splats.glb").read_bytes()

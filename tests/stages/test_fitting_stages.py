@@ -1,4 +1,4 @@
-"""train, prune, evaluate and export on a tiny scene: what they leave, and going on after a stop."""
+"""train, prune, evaluate and export on a tiny scene: their files, and resuming after a stop."""
 
 from __future__ import annotations
 

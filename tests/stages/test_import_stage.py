@@ -1,4 +1,4 @@
-"""What import leaves, in which frame, and what the views say of it."""
+"""The files of import, their frame, and their scores on the views."""
 
 import json
 import logging

@@ -276,7 +276,7 @@ def test_a_second_try_does_not_scan_the_video_again(video, tmp_path, monkeypatch
     assert files(tmp_path / "out") == before
 
 
-# What is fixed to the camera
+# Overlays
 
 
 def marked_walk(frames=60):
@@ -312,7 +312,7 @@ def test_an_overlay_is_masked_in_every_frame_and_drawn_and_told(marked, tmp_path
     x, y = (tracks.xy * (320, 180)).astype(int).T
     assert len(x) > 100
     assert mask[y, x].mean() > .99  # the mask is rounded to pixels
-    assert sum("is fixed to the camera" in notice and "overlay.png" in notice
+    assert sum("overlay (text" in notice and "overlay.png" in notice
                for notice in notices()) == 1
 
 

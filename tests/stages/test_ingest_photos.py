@@ -1,4 +1,4 @@
-"""What ingest makes of a folder of photos that are not all alike."""
+"""Ingest of a folder of photos that are not all alike."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""prune in rounds: the limits, going on after a kill, and one result for any number of threads."""
+"""prune in rounds: the limits, resuming after a kill, and one result for any number of threads."""
 
 from __future__ import annotations
 

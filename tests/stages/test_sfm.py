@@ -187,7 +187,7 @@ def kill_when(base, out, reached):
     parent.wait()
     _, alive = psutil.wait_procs(children, timeout=20)
     assert not alive, "the mapping process outlived its parent"
-    clear_leftovers(out)  # as a workspace does before a run goes on
+    clear_leftovers(out)  # as a workspace does before a run resumes
 
 
 def noted(out, step):

@@ -1,6 +1,6 @@
-"""train, prune and evaluate on the triton backend: all stages, and going on after a stop.
+"""train, prune and evaluate on the triton backend: all stages, and resuming after a stop.
 
-Where there is no GPU a step takes seconds in triton's interpreter.
+Without a GPU a step takes seconds in triton's interpreter.
 """
 
 from __future__ import annotations

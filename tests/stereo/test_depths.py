@@ -13,7 +13,7 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo import kernels
 from recon_cli.stereo.depths import (
     Levels,
-    Photo,
+    StereoView,
     camera_row,
     find_depths,
     find_partners,
@@ -34,7 +34,7 @@ def partners_of(cameras, most=20):
 def depths_of(views, guess=3.0, gains=None):
     """Depth of the views where surfaces are said to be `guess` away."""
     gains = [1.0] * len(views) if gains is None else gains
-    photos = [Photo(view, guess, guess, gain) for view, gain in zip(views, gains, strict=True)]
+    photos = [StereoView(view, guess, guess, gain) for view, gain in zip(views, gains, strict=True)]
     return find_depths(photos, partners_of([view.camera for view in views]), NEAR)
 
 
@@ -147,7 +147,7 @@ def ceiling_views(noise=1.0):
 
 
 def ceiling_depths(views, truths, levels=None, on_photo=lambda: None):
-    photos = [Photo(view, truth.min(), truth.max())
+    photos = [StereoView(view, truth.min(), truth.max())
               for view, truth in zip(views, truths, strict=True)]
     x, y = np.meshgrid(np.linspace(0, 5, 40), np.linspace(-2, 2, 30))
     points = np.stack([x, y, np.full_like(x, CEILING)], axis=-1).reshape(-1, 3)
@@ -184,7 +184,7 @@ def pair():
 
 
 def windows(values: np.ndarray, radius: int) -> np.ndarray:
-    """Means of square windows; a row and a column go on beyond the border."""
+    """Means of square windows; a row and a column continue beyond the border."""
     padded = np.pad(values, radius, mode="edge")
     height, width = values.shape
     return np.mean([padded[y:y + height, x:x + width]
@@ -283,13 +283,13 @@ def test_depth_in_columns_is_that_in_rows_of_the_turned_volume():
 STEP = 0.02
 
 
-def laid(inverse, image=None, sure=None, blank=None):
+def plane_depth(inverse, image=None, confirmed=None, blank=None):
     shape = inverse.shape
     image = np.full(shape, 90.0) if image is None else image
     out = np.zeros(shape, np.float32)
     pool.run(
         kernels.lay_planes, inverse.astype(np.float32), image.astype(np.float32),
-        np.ones(shape, bool) if sure is None else sure,
+        np.ones(shape, bool) if confirmed is None else confirmed,
         np.ones(shape, np.float32) if blank is None else blank.astype(np.float32), STEP, out,
         scratch=False)
     return out
@@ -300,7 +300,7 @@ def slope(height=40, width=60):
     return 0.5 + 0.006 * x - 0.004 * y
 
 
-def by_plain_float64(inverse, image, sure, y, x):
+def by_plain_float64(inverse, image, confirmed, y, x):
     """The plane about one pixel, by weighted least squares with a ridge on its slopes."""
     rows, columns = np.mgrid[-kernels._REACH:kernels._REACH + 1:kernels._STRIDE,
                              -kernels._REACH:kernels._REACH + 1:kernels._STRIDE].reshape(2, -1)
@@ -314,7 +314,7 @@ def by_plain_float64(inverse, image, sure, y, x):
         off = values - plane @ [np.ones(len(rows)), columns, rows]
         off = (off / spread) ** 2 + (greys / kernels._GREY) ** 2
         weights = np.maximum(1 - off / kernels._CUT, 0) ** 4 * (values > 0)
-        weights *= np.where(sure[rows + y, columns + x], 1, kernels._UNSURE)
+        weights *= np.where(confirmed[rows + y, columns + x], 1, kernels._UNSURE)
         A = np.stack([columns, rows], axis=1) - np.average(
             np.stack([columns, rows], axis=1), axis=0, weights=weights)
         b = values - np.average(values, weights=weights)
@@ -331,17 +331,17 @@ def test_planes_agree_with_plain_float64():
     inverse = slope(24, 30) + generator.normal(0, 0.5 * STEP, (24, 30))
     inverse[generator.random(inverse.shape) < 0.1] = 0
     inverse = inverse.astype(np.float32).astype(float)
-    image, sure = generator.normal(90, 3, inverse.shape), generator.random(inverse.shape) < 0.7
+    image, confirmed = generator.normal(90, 3, inverse.shape), generator.random(inverse.shape) < 0.7
     image = image.astype(np.float32).astype(float)
-    result = laid(inverse, image, sure)
+    result = plane_depth(inverse, image, confirmed)
     for y, x in [(0, 0), (3, 20), (12, 15), (23, 29), (14, 2)]:
-        expected = by_plain_float64(inverse, image, sure, y, x) if inverse[y, x] > 0 else 0
+        expected = by_plain_float64(inverse, image, confirmed, y, x) if inverse[y, x] > 0 else 0
         assert result[y, x] == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_steps_of_a_slanted_wall_become_a_plane():
     steps = np.round(slope() / STEP) * STEP
-    error = np.abs(laid(steps) - slope())
+    error = np.abs(plane_depth(steps) - slope())
     assert error.max() < 0.4 * STEP
     assert error.mean() < 0.1 * np.abs(steps - slope()).mean()
 
@@ -350,21 +350,21 @@ def test_what_stands_before_a_wall_and_is_brighter_stays_before_it():
     inverse, image = np.full((40, 60), 0.5), np.full((40, 60), 90.0)
     inverse[:, 30:] += STEP
     image[:, 30:] += 30
-    np.testing.assert_allclose(laid(inverse, image), inverse, atol=1e-6)
+    np.testing.assert_allclose(plane_depth(inverse, image), inverse, atol=1e-6)
 
 
 def test_far_from_the_plane_so_far_nothing_counts():
     inverse = np.full((40, 60), 0.5)
     inverse[:, 30:] += 4 * STEP
-    np.testing.assert_allclose(laid(inverse), inverse, atol=1e-6)
+    np.testing.assert_allclose(plane_depth(inverse), inverse, atol=1e-6)
 
 
 def test_depths_that_another_view_agrees_with_outweigh_others():
-    inverse, sure = np.full((40, 60), 0.5), np.ones((40, 60), bool)
+    inverse, confirmed = np.full((40, 60), 0.5), np.ones((40, 60), bool)
     inverse[13:27, 23:37] += 0.7 * STEP
-    sure[13:27, 23:37] = False
-    assert np.abs(laid(inverse, sure=sure)[20, 30] - 0.5) < 0.02 * STEP
-    assert np.abs(laid(inverse)[20, 30] - 0.5) > 0.04 * STEP
+    confirmed[13:27, 23:37] = False
+    assert np.abs(plane_depth(inverse, confirmed=confirmed)[20, 30] - 0.5) < 0.02 * STEP
+    assert np.abs(plane_depth(inverse)[20, 30] - 0.5) > 0.04 * STEP
 
 
 def test_texture_and_missing_depths_stay_as_they_are():
@@ -372,7 +372,7 @@ def test_texture_and_missing_depths_stay_as_they_are():
     steps[:5] = 0
     blank = np.ones(steps.shape)
     blank[:, :30] = 0
-    result = laid(steps, blank=blank)
+    result = plane_depth(steps, blank=blank)
     np.testing.assert_array_equal(result[:, :30], steps[:, :30].astype(np.float32))
     assert not result[:5].any()
     assert (result[5:, 30:] != steps[5:, 30:].astype(np.float32)).any()

@@ -22,7 +22,7 @@ def run(state, task, until):
 
 
 def gradients_after_a_step(backend, views, monkeypatch, queue):
-    """What the optimizer is given, by name, and the state."""
+    """The optimizer's inputs, by name, and the state."""
     config = with_batches(views)
     state, task = first_state(config, backend=backend), tiny_task(config, backend=backend)
     state.queue, given = list(queue), {}

@@ -47,7 +47,7 @@ class InProcess:
         return 0
 
     def stop(self):
-        raise AssertionError("the others go on")
+        raise AssertionError("the others continue")
 
     def close(self):
         pass

@@ -70,7 +70,7 @@ def test_a_count_at_its_cap_from_the_start_stays():
 
 
 class Ticks:
-    """A clock that goes on by the same time whenever it is read."""
+    """A clock that advances by the same time whenever it is read."""
 
     def __init__(self, step=0.001):
         self.now, self.step = 0.0, step

@@ -1,4 +1,4 @@
-"""When a run that has flattened goes on to its final phase, and that a resumed one does too."""
+"""When a run that has flattened skips to its final phase, and that a resumed one does too."""
 
 from dataclasses import replace
 

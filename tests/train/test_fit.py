@@ -1,4 +1,4 @@
-"""The loop on a tiny scene of known truth: it learns, repeats itself, and goes on where it was."""
+"""The loop on a tiny scene of known truth: it learns, repeats itself, and resumes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Captures that break assumptions: training ends, is finite, and is no worse than it must be."""
+"""Captures that break assumptions: training ends, is finite, and is as good as it can be."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What is decided where the user left it open: in closed form, on a model of known cost."""
+"""Decisions that the user left open: in closed form, on a model of known cost."""
 
 from dataclasses import replace
 from functools import cached_property

@@ -119,7 +119,7 @@ def test_removed_gaussians_are_gone_and_the_others_keep_their_moments():
     assert torch.equal(state.splats.means, means[rows])
     assert torch.equal(state.optimizer.tensors()["adam.means.exp_avg"], moment[rows])
     assert moment[rows].abs().max() > 0
-    fit(state, task, 106)  # and training goes on
+    fit(state, task, 106)  # and training continues
 
 
 @pytest.mark.parametrize("name", [*PRUNE_SCORES, RANDOM])

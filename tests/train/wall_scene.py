@@ -9,7 +9,7 @@ from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.feature_trials import Candidate
+from recon_cli.train.feature_trials import TrialScene
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 
@@ -62,4 +62,4 @@ def scene(*, window=False, drift=0.0, config=CONFIG, views=VIEWS):
         gain = np.exp(drift * rng.normal(size=3))
         shots.append(TrainView(camera, (np.clip(rgb * gain, 0, 1) * 255).round().astype(np.uint8)))
     task = Task(shots, [], Schedule(config), EXTENT, "numba", torch.device("cpu"))
-    return Candidate(task, points, (255 * colors).clip(0, 255).astype(np.uint8), None)
+    return TrialScene(task, points, (255 * colors).clip(0, 255).astype(np.uint8), None)

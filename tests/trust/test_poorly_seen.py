@@ -22,7 +22,7 @@ def floor(side=4.0):
 def find(points, seen):
     """`seen` are by view the camera and which points it shows."""
     splats = dots(points)
-    support = Support.of(
+    support = Support.from_rows(
         [torch.from_numpy(np.flatnonzero(shown)) for _, shown in seen],
         np.array([center for center, _ in seen], float), torch.zeros(len(points)))
     frames = [f"{number}.png" for number in range(len(seen))]

@@ -1,4 +1,4 @@
-"""What Gaussians rest on, by scenes whose angles and errors are known."""
+"""The support of Gaussians, by scenes whose angles and errors are known."""
 
 import numpy as np
 import pytest

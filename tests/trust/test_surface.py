@@ -11,7 +11,7 @@ from recon_cli.trust.surface import find_cells, surface_rows, surface_shares
 
 def support_of(n, seen):
     """`seen` are by view the centre and the Gaussians that it shows."""
-    return Support.of([torch.as_tensor(rows) for _, rows in seen],
+    return Support.from_rows([torch.as_tensor(rows) for _, rows in seen],
                       np.array([center for center, _ in seen], float), torch.zeros(n))
 
 

@@ -1,4 +1,4 @@
-"""What is sent to browsers is what the Gaussians are, within what its numbers can hold."""
+"""Browsers receive the Gaussians within the precision of the sent numbers."""
 
 import dataclasses
 

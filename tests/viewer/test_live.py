@@ -158,7 +158,7 @@ def test_whatever_an_update_costs_its_share_of_the_time_is_bounded(clock, second
     for iteration in range(20_000):
         view.on_step(iteration, splats)
         clock.now += 0.05
-    cost = seconds + 0.25  # the page goes on drawing for as long
+    cost = seconds + 0.25  # the page continues to draw for as long
     possible = SHARE * (clock.now - begin) / cost
     assert 0.9 * possible <= len(shown) <= possible + 1
 

@@ -1,4 +1,4 @@
-"""What clicked points measure, and where a click meets the scene."""
+"""Measures of clicked points, and where a click meets the scene."""
 
 from __future__ import annotations
 

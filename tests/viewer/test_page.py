@@ -31,7 +31,7 @@ def sessions(monkeypatch):
 
 
 def picture(elsewhere, page, client, camera):
-    """What the browser draws for a camera, [H, W, 3] over black."""
+    """The browser's picture for a camera, [H, W, 3] over black."""
     turn = camera.viewmat[:3, :3].T
     asked = elsewhere.submit(
         client.get_render, camera.height, camera.width, transport_format="png", timeout=60,
@@ -98,10 +98,10 @@ def test_the_cameras_come_with_their_photos_when_they_are_asked_for(shown, page)
 
 def test_another_model_is_shown_and_counted(shown, page):
     opened(page, shown)
-    assert "25 of 25 Gaussians (pruned)" in page.page.inner_text("body")
+    assert "25 of 25 Gaussians (compact)" in page.page.inner_text("body")
     page.page.get_by_role("combobox", name="Model").click()
-    page.page.get_by_role("option", name="base").click()
-    page.page.get_by_text("of 60 Gaussians (base)").wait_for(timeout=60_000)
+    page.page.get_by_role("option", name="original").click()
+    page.page.get_by_text("of 60 Gaussians (original)").wait_for(timeout=60_000)
 
 
 def test_the_box_hides_what_is_outside_and_is_given_as_export_takes_it(shown, page):

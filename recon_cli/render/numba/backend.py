@@ -66,7 +66,7 @@ def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
     lease = Lease()
     rows = torch.empty(camera.height, camera.width, dtype=torch.int32)
     lease.view_pass.crossing(
-        PackedSplats.of(splats.parameters().values()), camera,
+        PackedSplats.from_tensors(splats.parameters().values()), camera,
         RenderSettings(np.zeros(3, np.float32), 0), level, rows.view(-1).numpy(),
         Statistics.zeros(splats.means.detach()))
     return rows.long()
@@ -92,7 +92,7 @@ class _Render(torch.autograd.Function):
                              background.new_empty(size))
         lease = Lease()
         lease.view_pass.forward(
-            PackedSplats.of(tensors), camera, settings,
+            PackedSplats.from_tensors(tensors), camera, settings,
             ImageBuffers(flat(rgb), flat(alpha), flat(depth)), statistics)
         ctx.save_for_backward(*tensors)
         ctx.lease, ctx.statistics, ctx.scores = lease, statistics, settings.scores
@@ -108,7 +108,7 @@ class _Render(torch.autograd.Function):
         gradients = [torch.empty_like(tensor, memory_format=torch.contiguous_format)
                      for tensor in tensors]
         ctx.lease.view_pass.backward(
-            PackedSplats.of(tensors), PackedSplats.of(gradients),
+            PackedSplats.from_tensors(tensors), PackedSplats.from_tensors(gradients),
             ImageBuffers(flat(grad_rgb), flat(grad_alpha), flat(grad_depth)), ctx.statistics,
             details=True, loo=ctx.scores)
         grad_background = None
@@ -191,7 +191,7 @@ def _can_run_all() -> bool:
 
 
 def _compile(folder: Path) -> None:
-    """Compiles what a folder lacks; all kernels, where what it holds cannot be read."""
+    """Compiles the kernels that a folder lacks; all of them where its files cannot be read."""
     has_files = bool(_finished(folder))  # a crash can lose _READY and cut files short
     try:
         _run_all()
@@ -219,7 +219,7 @@ def _without_scipy() -> Iterator[None]:
 
 
 def _clear(folder: Path) -> None:
-    """Deletes what a folder holds; another process may do so at the same time."""
+    """Deletes the files of a folder; another process may do so at the same time."""
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)

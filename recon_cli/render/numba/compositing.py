@@ -32,7 +32,7 @@ _PLANES = 9
 _DX, _DY, _EXTENT_X, _EXTENT_Y, _SLOPE_Y, _HALF_Y, _U_X, _U_Y, _V_Y = (
     LOCAL * BATCH + i * BATCH for i in range(_PLANES))
 BATCH_FLOATS = LOCAL * BATCH
-# Which patches each instance meets, bits as whole numbers: a plane for as many rows of patches as
+# Which patches each instance meets, bits as integers: a plane for as many rows of patches as
 # float32 holds exactly
 _MET = (LOCAL + _PLANES) * BATCH
 _MET_ROWS = 24 // PATCHES_X
@@ -113,7 +113,7 @@ def find_patches(batch, patches, k, count):
         y = minimum(maximum(-rightmost, low), high)
         along = y * per_extent
         left = slope * y - half * square_root(maximum(1.0 - along * along, 0.0))
-        # columns of pixels of the tile; the first one in is the next whole number
+        # columns of pixels of the tile; the first one in is the next integer
         left = -floor(dx - maximum(left, -extent_x) + _MARGIN)
         right = floor(minimum(right, extent_x) - dx + _MARGIN)
         inside = (low <= high) & (left <= right) & valid

@@ -101,7 +101,7 @@ def gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, 
 
 @inlined
 def unit_quaternion(scratch):
-    """Returns w, x, y, z of length 1, and what a gradient is multiplied by.
+    """Returns w, x, y, z of length 1, and the factor of a gradient.
 
     The largest entry is divided out first: small squares vanish. Zeros: no rotation, no gradient.
     """

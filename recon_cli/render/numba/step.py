@@ -60,7 +60,7 @@ class PhotometricStep:
             self.statistics = Statistics.zeros(splats.means.detach())
         view, pixels = self._pass, height * width
         rgb = view.take("rgb", CHANNELS * pixels)
-        packed = PackedSplats.of(splats.parameters().values())
+        packed = PackedSplats.from_tensors(splats.parameters().values())
         settings = RenderSettings(
             flat(splats.background).copy(), options.sh_degree, options.scores,
             counting=target.mask if options.scores or options.loo else None)
@@ -86,7 +86,7 @@ class PhotometricStep:
                                 np.tile(target.gain, width))
         nothing = view.take("nothing", 0)
         view.backward(
-            packed, PackedSplats.of(gradients.parameters().values()),
+            packed, PackedSplats.from_tensors(gradients.parameters().values()),
             ImageBuffers(grad_rgb, nothing, nothing), self.statistics, details=options.details,
             loo=options.loo, harmonics=options.harmonics)
         return loss

@@ -45,7 +45,7 @@ class PackedSplats:
     stride: int
 
     @staticmethod
-    def of(tensors: Iterable[Tensor]) -> PackedSplats:
+    def from_tensors(tensors: Iterable[Tensor]) -> PackedSplats:
         """Packs the raw parameters of splats: the same memory where they are contiguous."""
         *tensors, sh_rest = tensors
         means, quats, log_scales, logits, sh_dc = (flat(tensor) for tensor in tensors)

@@ -1,4 +1,4 @@
-"""Blocks of the torch backend: DEPTH Gaussians over a group of tiles, as dense tensors.
+"""Tile blocks of the torch backend: DEPTH Gaussians over a group of tiles, as dense tensors.
 
 Inside a tile a Gaussian is whitened: with the covariance [[a, b], [b, c]], q = u^2 + v^2 where
 u = sqrt(c / det) (dx - b/c dy) and v = dy / sqrt(c). Both are affine in the pixel, so one small
@@ -27,7 +27,7 @@ _PAIRS = {"cpu": 1 << 18, "cuda": 1 << 25}  # pairs a block: the second-level ca
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What the blocks read, one row a Gaussian; the last row is empty and pads short lists."""
+    """The inputs of the blocks, one row a Gaussian; the last row is empty and pads short lists."""
 
     means2d: Tensor  # [M+1, 2] float64 centres, so that offsets from a far centre keep their digits
     whitening: Tensor  # [M+1, 3] float64 factors (l11, l12, l22) of the inverse covariance
@@ -55,7 +55,7 @@ class Scratch:
 
 
 @dataclass(eq=False)
-class Block:
+class TileBlock:
     """A run of instances of some tiles."""
 
     tiles: Tensor  # [n] tile indices
@@ -92,7 +92,7 @@ class InstanceLists:
     gaussians: Tensor  # [E+1] row in the table by position; the last one is the empty row
 
     @staticmethod
-    def of(instances: Instances) -> InstanceLists:
+    def from_instances(instances: Instances) -> InstanceLists:
         """Returns the lists of some instances."""
         empty_row = len(instances.per_gaussian)
         gaussians = torch.nn.functional.pad(instances.gaussians, (0, 1), value=empty_row)
@@ -106,7 +106,7 @@ class InstanceLists:
         size = max(1, _PAIRS[order.device.type] // (DEPTH * PIXELS))
         return list(torch.split(order, size)) if len(order) else []
 
-    def walk(self, tiles: Tensor, transmittance: Tensor) -> Iterator[Block]:
+    def walk(self, tiles: Tensor, transmittance: Tensor) -> Iterator[TileBlock]:
         """Yields the blocks of a group front to back, without tiles that have ended or are opaque.
 
         `tiles` [n] are the group, longest list first; the caller updates `transmittance` [tiles,
@@ -124,7 +124,7 @@ class InstanceLists:
             positions = torch.where(
                 index < self.counts[tiles, None], self.first[tiles, None] + index,
                 len(self.gaussians) - 1)
-            yield Block(tiles, positions, self.gaussians[positions], transmittance[tiles])
+            yield TileBlock(tiles, positions, self.gaussians[positions], transmittance[tiles])
 
 
 def pixel_monomials(like: Tensor) -> Tensor:
@@ -134,7 +134,7 @@ def pixel_monomials(like: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def whitening_of(table: Table, block: Block, tiles_x: int) -> Tensor:
+def whitening_of(table: Table, block: TileBlock, tiles_x: int) -> Tensor:
     """Returns [n, K, 5]: u = k0 + k1 x + k2 y and v = k3 + k4 y at offsets from the tile centre."""
     l11, l12, l22 = table.whitening[block.rows].unbind(-1)
     center_x = (block.tiles % tiles_x) * TILE + TILE / 2
@@ -145,7 +145,7 @@ def whitening_of(table: Table, block: Block, tiles_x: int) -> Tensor:
 
 
 def alphas(
-    table: Table, block: Block, affine: Tensor, monomials: Tensor, scratch: Scratch
+    table: Table, block: TileBlock, affine: Tensor, monomials: Tensor, scratch: Scratch
 ) -> Tensor:
     """Returns alpha [n, K, 256] after both thresholds: alpha = o exp(-q / 2).
 

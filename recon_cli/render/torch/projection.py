@@ -2,7 +2,7 @@
 
 EWA splatting (Zwicker et al. 2002, eqs. 24 to 31) as in 3D Gaussian Splatting (Kerbl et al. 2023,
 eq. 5). A first pass without gradients decides which Gaussians may touch the image, so that memory
-follows what is seen.
+follows the visible Gaussians.
 """
 
 from __future__ import annotations

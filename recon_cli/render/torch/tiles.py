@@ -18,9 +18,9 @@ from recon_cli.render.torch.blocks import (
     CHANNELS,
     DEPTH,
     PIXELS,
-    Block,
     InstanceLists,
     Scratch,
+    TileBlock,
     alphas,
     build_table,
     composite,
@@ -71,7 +71,7 @@ def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
     rows = torch.full(transmittance.shape, -1, dtype=torch.int64, device=means2d.device)
     monomials, scratch = pixel_monomials(means2d)[:3], Scratch(means2d)
     ids = torch.nn.functional.pad(projection.ids, (0, 1), value=-1)
-    lists = InstanceLists.of(instances)
+    lists = InstanceLists.from_instances(instances)
     for tiles in lists.groups():
         for block in lists.walk(tiles, transmittance):
             affine = whitening_of(table, block, instances.tiles_x)
@@ -87,7 +87,7 @@ def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What compositing reads beside the tensors that have gradients."""
+    """The inputs of compositing beside the tensors that have gradients."""
 
     projection: Projection
     instances: Instances
@@ -115,9 +115,9 @@ class _Rasterize(torch.autograd.Function):
         if view.scores and view.mask is not None:
             counting = _to_tiles(view.mask.to(means2d)[..., None], instances)[..., 0]
         tally = _Tally(instances, means2d, counting) if view.scores else None
-        lists = InstanceLists.of(instances)
+        lists = InstanceLists.from_instances(instances)
 
-        def composite_group(tiles: Tensor) -> list[Block]:
+        def composite_group(tiles: Tensor) -> list[TileBlock]:
             blocks = []
             for block in lists.walk(tiles, transmittance):
                 affine = whitening_of(table, block, instances.tiles_x)
@@ -164,7 +164,7 @@ class _Rasterize(torch.autograd.Function):
         scored = means2d.new_zeros(len(instances.gaussians) + 1, 3) if view.scores else None
         upper = means2d.new_ones(DEPTH, DEPTH).triu(1)
 
-        def descend_group(blocks: list[Block]) -> None:
+        def descend_group(blocks: list[TileBlock]) -> None:
             for block in reversed(blocks):
                 n, k = block.rows.shape
                 affine = whitening_of(table, block, instances.tiles_x)
@@ -206,7 +206,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _leave_one_out(
-    used: Tensor, odds: Tensor, live: Tensor, composited: Tensor, block: Block, upper: Tensor,
+    used: Tensor, odds: Tensor, live: Tensor, composited: Tensor, block: TileBlock, upper: Tensor,
     counting: Tensor | None,
 ) -> Tensor:
     """Returns the block's part [n, K] of loo and moves `composited` in front of the block.
@@ -222,7 +222,7 @@ def _leave_one_out(
         weighted = own * odds
         later = torch.matmul(upper, weighted) + composited[block.tiles, None, :, channel]
         composited[block.tiles, :, channel] += weighted.sum(1)
-        # `later` still counts what lies behind a stopped pixel; there the Gaussian is no part
+        # `later` still counts what lies behind a stopped pixel; there the Gaussian is not part
         total += (((own - later) * odds) ** 2 * part).sum(-1)
     return total
 
@@ -249,7 +249,7 @@ class _Tally:
         self._hits, self._sum, self._max = (
             like.new_zeros(len(instances.gaussians) + 1) for _ in range(3))
 
-    def add(self, block: Block, weights: Tensor) -> None:
+    def add(self, block: TileBlock, weights: Tensor) -> None:
         """Takes the blend weights [n, K, 256] of a block."""
         if self._counting is not None:
             weights = weights * self._counting[block.tiles, None]

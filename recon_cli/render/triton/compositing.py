@@ -51,7 +51,7 @@ def log2_alpha(u_x, u_y, v_y, log2_opacity, u_0, v_0, column, row):
 
 @triton.jit
 def alpha_of(power):
-    """Returns alpha of log2 alpha; 0 where that is no fragment."""
+    """Returns alpha of log2 alpha; 0 below ALPHA_MIN."""
     return tl.where(power >= LOG2_ALPHA_MIN, tl.exp2(tl.minimum(power, LOG2_ALPHA_MAX)), 0.0)
 
 
@@ -100,7 +100,7 @@ def composite(
         final: [tiles, AREA] out with KEEP, transmittance behind the last fragment.
         last: [tiles, AREA] int32 out with KEEP, number in the tile of the last fragment, from 1.
         states: [buckets, KEPT, AREA], with PLAIN one less, out with KEEP, at the end of each bucket
-            behind which the tile goes on.
+            behind which the tile continues.
         bucket_tiles: [buckets] int32 out with KEEP, the tile of each.
         slots: [E] int64, where the scores of an instance go.
         counting: [H, W] uint8, pixels that count in the scores, with MASKED.

@@ -23,7 +23,7 @@ class Recorder(Protocol):
     """Turns work into work that does the same to the same memory."""
 
     def reset(self) -> None:
-        """Frees the memory of all recordings, which are no longer referenced."""
+        """Frees the memory of all recordings, once nothing refers to them."""
 
     def __call__(self, work: Work) -> Work:
         """Returns a function that replays the work; RuntimeError if it cannot be recorded."""
@@ -38,7 +38,7 @@ class Graphs:
         self._recorded: dict[Hashable, Work] = {}
 
     @staticmethod
-    def of(device: torch.device) -> Graphs:
+    def for_device(device: torch.device) -> Graphs:
         """Returns CUDA graphs on a CUDA device, and no recording elsewhere."""
         return Graphs(_CudaGraphs(device) if device.type == "cuda" else None)
 
@@ -60,7 +60,7 @@ class Graphs:
             try:
                 self._recorded[key] = self._recorder(work)
             except RuntimeError as error:  # the driver's, of whatever kind; nothing was done yet
-                logger.warning("training goes on without CUDA graphs, more slowly: %s", error)
+                logger.warning("training continues without CUDA graphs, more slowly: %s", error)
                 self._recorder = None
                 work()
                 return

@@ -1,4 +1,4 @@
-"""The ellipse and the colour of a Gaussian in a view: what both passes over the Gaussians compute.
+"""The ellipse and the colour of a Gaussian in a view, for both passes over the Gaussians.
 
 EWA splatting (Zwicker et al. 2002, eqs. 24 to 31): V = J W R S, Sigma' = V V^T + 0.3 I. Positions
 are in float64, because an error of the mean in pixels is an error of every alpha; shapes in
@@ -81,7 +81,7 @@ def number(view, place: tl.constexpr):
 
 @triton.jit
 def unit_quaternion(quats, i, here):
-    """Returns w, x, y, z of length 1, and what a gradient is multiplied by.
+    """Returns w, x, y, z of length 1, and the factor of a gradient.
 
     The largest entry is divided out first: small squares vanish. Zeros: no rotation, no gradient.
     """

@@ -40,7 +40,7 @@ _LAST_KEY = (1 << 63) - 1  # sorts behind all others
 
 @dataclass(frozen=True, eq=False)
 class ViewInput:
-    """What the kernels over the Gaussians of a view read."""
+    """The inputs of the kernels over the Gaussians of a view."""
 
     splats: Splats  # contiguous
     view: Tensor  # see `gaussian.camera_buffer`
@@ -90,7 +90,7 @@ class CompositedImage:
 
 @dataclass(frozen=True)
 class BackwardOptions:
-    """What the backward pass computes beside the gradients."""
+    """The outputs of the backward pass beside the gradients."""
 
     plain: bool = False  # the loss depends on colours alone
     details: bool = True  # variance is wanted

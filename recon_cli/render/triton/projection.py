@@ -221,7 +221,7 @@ def list_tiles(shapes, centers, depths, starts, view, count, tiles_x, keys, owne
 @triton.jit(do_not_specialize=("count", "tiles_x"))
 def place(keys, slots, owners, centers, records, starts, count, tiles_x, members, offsets,
           BLOCK: tl.constexpr):
-    """Writes what compositing reads of each instance, in the order of compositing.
+    """Writes the inputs of compositing for each instance, in its order.
 
     `keys` [E] int64 are sorted, `slots` [E] int64 the slot of each key, `owners` [E] int32 the
     Gaussian of each slot; the last of `starts` [count + 1] int32 is how many instances there are.

@@ -60,7 +60,7 @@ class PhotometricStep:
     def __init__(
         self, device: torch.device, *, graphs: Graphs | None = None, room: int | None = None
     ) -> None:
-        self._graphs = Graphs.of(device) if graphs is None else graphs
+        self._graphs = Graphs.for_device(device) if graphs is None else graphs
         self._room, self.status, self._most = room or 0, StepStatus(device), 0
         self._cameras: dict[int, tuple[Camera, Tensor]] = {}
         # of the last view, overwritten by each call; all zero where the view does not count
@@ -159,7 +159,7 @@ class PhotometricStep:
         return self._pixels[key]
 
     def _photograph(self, source: NDArray[Any]) -> Tensor:
-        """Returns an array on the device, where it stays, or on the host if there is no room."""
+        """Returns an array on the device, where it stays, or on the host if it does not fit."""
         known = self._photographs.get(id(source))
         if known is not None and known[0] is source:
             return known[1]
@@ -176,7 +176,7 @@ class PhotometricStep:
         self, source: ViewInput, gradients: Splats, camera: Camera, target: _DeviceTarget,
         options: StepOptions,
     ) -> Callable[[], None]:
-        """Returns the work on a view of this size, which reads what differs from view to view."""
+        """Returns the work on views of this size; it reads the values that differ among them."""
         room, statistics = self._room, self.statistics
         backward = BackwardOptions(
             plain=True, details=options.details, loo=options.loo, harmonics=options.harmonics)

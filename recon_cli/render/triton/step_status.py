@@ -1,4 +1,4 @@
-"""What the device records while the host does not wait: which steps counted, and why not."""
+"""The device's record while the host does not wait: which steps counted, and why not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ INFINITE = tl.constexpr(float("inf"))
 
 @triton.jit(do_not_specialize=("count", "room"))
 def admit_kernel(ends, count, room, status, starts, fits, BLOCK: tl.constexpr):
-    """Lets a step go on if its instances fit into `room` and no step before it was stopped.
+    """Lets a step continue if its instances fit into `room` and no step before it was stopped.
 
     Every program decides the same; the first one writes it into `fits` [1] int32. From `ends`
     [count + 1] int64, see `passes.ProjectedSplats`, come `starts` [count + 1] int32, all zero where
@@ -88,7 +88,7 @@ class StepStatus:
         return self.numbers[LOSS.value]
 
     def close(self) -> StepReport:
-        """Waits for the device, returns what it recorded, and resets it."""
+        """Waits for the device, returns its record, and resets it."""
         _, stopped, needed, skipped, instances, loss = self.numbers.tolist()
         self.numbers.copy_(self._first)
         return StepReport(

@@ -1,0 +1,134 @@
+"""One sentence about the result of each stage, for `recon status` and the end of a stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import singledispatch
+from typing import Any
+
+from recon_cli.config.stages import MODEL_LABELS
+from recon_cli.errors import ManifestError, format_count
+from recon_cli.progress import format_megabytes
+from recon_cli.stages import IMPORT, STAGES
+from recon_cli.workspace.export_record import ExportSummary
+from recon_cli.workspace.summaries import (
+    DenoiseSummary,
+    EvaluateSummary,
+    ImportSummary,
+    IngestSummary,
+    JsonRecord,
+    PruneSummary,
+    SfmSummary,
+    TrainSummary,
+)
+
+
+def describe_summary(stage: str, summary: Mapping[str, Any]) -> str:
+    """Returns a sentence about a stage's summary; empty where another version of recon wrote it."""
+    rows = (IMPORT, *STAGES) if "sha256" in summary else STAGES
+    kind = next(row.summary for row in rows if row.name == stage)
+    try:
+        return describe(kind.from_json(summary))
+    except ManifestError:  # the stage is stale then, and its reason is shown
+        return ""
+
+
+@singledispatch
+def describe(record: JsonRecord) -> str:  # noqa: ARG001
+    """Returns a sentence about a stage's summary; empty for a record that has none."""
+    return ""
+
+
+@describe.register
+def _(ingest: IngestSummary) -> str:
+    source = {"mixed": "videos and photos"}.get(ingest.kind, ingest.kind)
+    of = f" of {ingest.decoded_frames:,}" if ingest.decoded_frames else ""
+    return _join([
+        f"{ingest.frames:,}{of} frames ({source}, {ingest.width}x{ingest.height}), "
+        f"{ingest.held_out:,} held out for the score",
+        f"{ingest.dropped_blurred:,} too blurred, clipped or flat" if ingest.dropped_blurred
+        else "",
+        f"{ingest.lost_frames:,} damaged or missing" if ingest.lost_frames else "",
+        f"{format_count(len(ingest.skipped), 'file')} skipped" if ingest.skipped else ""])
+
+
+@describe.register
+def _(denoise: DenoiseSummary) -> str:
+    return (f"noise {denoise.median_sigma_255:.1f} of 255, {denoise.denoised:,} of "
+            f"{denoise.frames:,} frames filtered")
+
+
+@describe.register
+def _(sfm: SfmSummary) -> str:
+    if sfm.trusted is None:
+        trust = "the poses of the data set are used" if sfm.poses else ""
+    else:
+        trust = f"the model is {'' if sfm.trusted else 'NOT '}trusted"
+    return _join([
+        f"{sfm.registered:,} of {sfm.frames:,} frames placed",
+        f"this is part {sfm.part} of {len(sfm.parts)}" if sfm.part is not None else "",
+        f"{len(sfm.left_out):,} left out" if sfm.left_out else "", trust])
+
+
+@describe.register
+def _(train: TrainSummary) -> str:
+    early = train.stopped_early_at is not None
+    return _join([
+        f"{train.gaussians:,} Gaussians after {train.iterations:,} iterations"
+        f"{f' in {train.blocks} blocks' if train.blocks else ''}"
+        f"{_validation(train.validation_psnr_db)}",
+        f"stopped early, {train.planned_iterations:,} were planned" if early else "",
+        f"continued from {train.imported_from}" if train.imported_from else "",
+        f"{format_count(train.skipped_steps, 'step')} skipped" if train.skipped_steps else ""])
+
+
+@describe.register
+def _(imported: ImportSummary) -> str:
+    views = format_count(imported.views, "training view")
+    score = ("" if imported.training_psnr_db is None else
+             f", {imported.training_psnr_db:.2f} dB on {views}")
+    return f"{imported.gaussians:,} Gaussians from {imported.imported_from}{score}"
+
+
+@describe.register
+def _(prune: PruneSummary) -> str:
+    before = prune.validation_psnr_db_before
+    return (f"{prune.gaussians:,} of {prune.gaussians_before:,} Gaussians kept"
+            f"{_validation(prune.validation_psnr_db)}"
+            f"{'' if before is None else f' ({before:.2f} dB before)'}")
+
+
+@describe.register
+def _(scores: EvaluateSummary) -> str:
+    models = [f"{scores.base_psnr_db:.2f} dB (SSIM {scores.base_ssim:.3f})"]
+    if scores.pruned_psnr_db is not None and scores.pruned_ssim is not None:
+        models.append(f"the compact model {scores.pruned_psnr_db:.2f} dB "
+                      f"(SSIM {scores.pruned_ssim:.3f})")
+    missing = len(scores.unregistered_test)
+    return _join([
+        f"{', '.join(models)} on {format_count(scores.test_views, 'held-out view')}",
+        f"{format_count(missing, 'held-out view')} without a camera" if missing else ""])
+
+
+@describe.register
+def _(export: ExportSummary) -> str:
+    model = MODEL_LABELS.get(export.model, export.model)
+    return _join([
+        f"{export.file} ({model} model, {export.gaussians:,} Gaussians, "
+        f"{format_megabytes(export.bytes)})",
+        f"also {', '.join(fresh_files(export)[1:])}" if export.files else "",
+        f"NOT written: {', '.join(export.failed)}" if export.failed else ""])
+
+
+def fresh_files(export: ExportSummary) -> list[str]:
+    """Returns the names of an export's files that are up to date."""
+    others = (export.files or {}).values()
+    return [export.file, *(one.file for one in others if not one.stale)]
+
+
+def _validation(psnr_db: float | None) -> str:
+    return "" if psnr_db is None else f", {psnr_db:.2f} dB on validation views"
+
+
+def _join(parts: Sequence[str]) -> str:
+    return "; ".join(filter(None, parts))
