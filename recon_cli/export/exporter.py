@@ -21,6 +21,7 @@ from recon_cli.datasets.transforms import write_transforms
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.export.cleanup import drop_floaters, drop_islands
 from recon_cli.export.coordinate_frame import ExportFrame, find_room_frame
+from recon_cli.export.page import draw_poster, find_title, plan_tour
 from recon_cli.export.reduce import LowerDegrees, crop, fit_to_size, measure_change
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
@@ -38,7 +39,7 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.axes import PLY, Z_UP
 from recon_cli.splats.compressed_ply import write_compressed_ply
 from recon_cli.splats.glb import nearest_axes, nearest_up, write_glb
-from recon_cli.splats.html import write_html
+from recon_cli.splats.html import PageStyle, write_html
 from recon_cli.splats.lod import LOD_META, make_levels, write_lod
 from recon_cli.splats.ply import describe_scene, write_ply, write_points
 from recon_cli.splats.registry import FORMATS, scene_file
@@ -48,6 +49,7 @@ from recon_cli.splats.spz import LARGEST_SCALE, write_spz
 from recon_cli.train.finished_model import FINAL
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.train.train_data import load_views, read_config
+from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.export_record import ExportChange, ExportedFile, max_loss_db
 from recon_cli.workspace.records import ImportRecord, has_views, read_frame_list
 
@@ -188,8 +190,7 @@ class Exporter:
             write_spz(path, whole, version=self._config.spz_version,
                       axes=_SPZ_AXES[self._up_axis], antialiased=self._antialiased)
         elif name == "html":
-            write_html(path, whole, title=self._title, up=self._up,
-                       views=self._place(self._scene.train))
+            self._write_page(path, whole)
         elif name == "splat":
             write_splat(path, self._at_degree(splats, 0).with_sphere())
         elif name == "compressed.ply":
@@ -198,6 +199,18 @@ class Exporter:
                 path, whole, centers=np.stack([camera.center for _, camera in seen_from]))
         else:
             FORMATS[name].write(path, whole)
+
+    def _write_page(self, path: Path, splats: Splats) -> None:
+        views = self._place(self._scene.train)
+        on_device = splats.map(lambda tensor: tensor.to(self._ctx.device))
+        tour = plan_tour(on_device, [camera for _, camera in views], self._ctx)
+        poster, preview = None, path.with_suffix(".jpg")
+        if tour is not None:
+            poster = draw_poster(on_device, tour, self._ctx)
+            write_bytes(preview, poster)
+        write_html(path, splats, up=self._up, views=views, style=PageStyle(
+            self._config.title or find_title(self._title), tour, poster,
+            preview.name if poster else None, self._config.credits))
 
     def _size_of(self, name: str) -> Callable[[Splats], int]:
         """Returns the function that measures the size of a file of a format."""

@@ -25,10 +25,12 @@ _FRAME = ("scale_between", "transform", "up")
 _SCENE = (*_FRAME, "crop", "drop_floaters", "drop_islands", "drop_backdrop", "sh_degree", "max_mb")
 _MESH = ("max_triangles", "voxel")
 _OWN: Mapping[str, tuple[str, ...]] = {  # options that decide on files of one format alone
-    "spz": ("spz_version",), "sog": ("max_loss",), "lod": ("max_loss",),
+    "html": ("title", "credits"), "spz": ("spz_version",),
+    "sog": ("max_loss",), "lod": ("max_loss",),
     "mesh.ply": _MESH, "mesh.glb": _MESH, "mesh.obj": _MESH, "plan.svg": _MESH}
 _PATTERNS: Mapping[str, tuple[str, ...]] = {  # of files by format; of others splats.<format>
     "ply": ("splats.ply", "transform.json"), "lod": ("lod/*",),
+    "html": ("splats.html", "splats.jpg"),
     "colmap": ("sparse/*", "images/*", "colmap/*"),  # colmap/: before version 5
     "transforms.json": ("transforms.json", "sparse_pc.ply", "images/*"),
     "plan.svg": ("plan.svg", "measures.json"),
