@@ -9,7 +9,7 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
-from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TRAINING, RenderRequest
+from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TOUR, TRAINING, RenderRequest
 
 
 def _outputs(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[str, ...]:
@@ -35,9 +35,13 @@ def _color(
 
 @verb("render")
 @click.option(
-    "--path", metavar="training|orbit|FILE.json",
+    "--path", metavar="training|orbit|tour|FILE.json",
     help="Camera path: smooth through the training cameras, a circle around their centre of "
-         "view, or a camera path of nerfstudio's viewer.  [default: training]")
+         "view, a quiet tour, or a camera path of nerfstudio's viewer.  [default: training]")
+@click.option(
+    "--tour", is_flag=True,
+    help="Short for --path tour: a quiet minute along the path of the capture, as large as the "
+         "frames, up to 1280 pixels.  [default: off]")
 @click.option(
     "--views", multiple=True, metavar="test|train|validation|NAME",
     help="Render these views instead of a path: a set, or a frame by its name; may be repeated.  "
@@ -79,16 +83,18 @@ def _color(
 @options.compute()
 @options.common()
 @pass_call
-def render(call: Call, /, path: str | None, views: tuple[str, ...], **request: Any) -> None:
+def render(
+    call: Call, /, path: str | None, tour: bool, views: tuple[str, ...], **request: Any
+) -> None:
     """Render the trained model along a path, or at given views.
 
     Images or a video of colour, depth and alpha. Finished frames of an interrupted run are kept.
     The cameras of a path are written to camera_path.json, which --path accepts.
     """
-    if path is not None and views:
-        raise click.UsageError("--path and --views exclude each other.")
+    if sum(bool(way) for way in (path, tour, views)) > 1:
+        raise click.UsageError("--path, --tour and --views exclude each other.")
     # the other options are fields of the request
-    checked = RenderRequest(path=path or TRAINING, views=views, **request)
+    checked = RenderRequest(path=TOUR if tour else path or TRAINING, views=views, **request)
     from recon_cli.flythrough.run import render_frames
 
     click.echo(render_frames(checked, open_job(call)))

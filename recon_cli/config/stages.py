@@ -393,6 +393,10 @@ class ExportConfig(StageConfig):
     max_loss: float | None = option(
         None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
         per_file=True, automatic=describe_max_loss())
+    title: str | None = option(
+        None, "Title of the page (html).", metavar="TEXT", per_file=True,
+        automatic="from the name of the capture")
+    credits: bool = option(False, "Say on the page (html) what made it.", per_file=True)
     max_triangles: int = option(
         300_000, "Maximum number of triangles of a mesh.", minimum=4, per_file=True)
     voxel: float | None = option(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.export.coordinate_frame import ExportFrame
+from recon_cli.export.page import make_guide
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.training_scene import load_scene
@@ -19,7 +20,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
-from recon_cli.splats.format import WriteSettings
+from recon_cli.splats.format import Guide, WriteSettings
 from recon_cli.train.train_data import load_views, read_config
 from recon_cli.workspace.records import ImportRecord, has_views, read_frame_list
 
@@ -91,7 +92,13 @@ class ExportSource:
             title = read_frame_list(self._inputs.folders["ingest"]).groups[0].name
         return WriteSettings(
             up=self.frame.up, antialiased=self._antialiased, title=title,
-            views=self.place(self.scene.train))
+            views=self.place(self.scene.train), guide=self._guide)
+
+    def _guide(self, splats: Splats) -> Guide | None:
+        if not self.has_views:
+            return None
+        cameras = [camera for _, camera in self.place(self.scene.train)]
+        return make_guide(splats, cameras, self.ctx)
 
     @cached_property
     def _run_config(self) -> RunConfig:

@@ -13,12 +13,19 @@ import numpy as np
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.export.synthetic_cameras import CAMERAS_AROUND
 from recon_cli.flythrough.camera_path import CameraPath, read_camera_path
-from recon_cli.flythrough.paths import find_look_at, orbit_path, smooth_path
-from recon_cli.flythrough.request import FPS, ORBIT, TRAINING, RenderRequest
+from recon_cli.flythrough.request import (
+    FPS,
+    ORBIT,
+    TOUR,
+    TOUR_SIZE,
+    TRAINING,
+    RenderRequest,
+)
 from recon_cli.flythrough.trained_scene import TrainedScene
 from recon_cli.io.images import fit_camera, fit_size
 from recon_cli.machine import free_memory_bytes
 from recon_cli.scene.camera import MAX_SIDE, Camera
+from recon_cli.scene.camera_paths import find_look_at, orbit_path, smooth_path, tour_path
 from recon_cli.scene.scene import Scene, View
 
 # Of a frame with all outputs, from 1200x680 to 3000x1700 pixels: 55 with numba, 93 with torch.
@@ -40,7 +47,7 @@ def plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
     StageError if views are requested and there are none, ConfigError for a size or name that cannot
     be used, FormatError for the file of a path.
     """
-    if not trained.has_views and (request.views or request.path == TRAINING):
+    if not trained.has_views and (request.views or request.path in (TRAINING, TOUR)):
         raise StageError(
             "The scene was imported without views, so there are no cameras of its own to render.",
             hint=f"Give --path {ORBIT}, or --path FILE.json with cameras.")
@@ -68,6 +75,8 @@ def _make_path(request: RenderRequest, trained: TrainedScene) -> CameraPath:
     viewmats = np.stack([camera.viewmat for camera in cameras])
     if request.path == TRAINING:
         viewmats = smooth_path(viewmats, count)
+    elif request.path == TOUR:
+        viewmats = tour_path(viewmats, count)
     else:
         centers = np.stack([camera.center for camera in cameras])
         viewmats = orbit_path(centers, find_look_at(cameras, scene.points), trained.up(), count)
@@ -75,7 +84,9 @@ def _make_path(request: RenderRequest, trained: TrainedScene) -> CameraPath:
     kinds = [(camera.width, camera.height, camera.fy) for camera in cameras]
     usual = cameras[kinds.index(Counter(kinds).most_common(1)[0][0])]
     fov = np.degrees(2 * np.arctan(usual.height / 2 / usual.fy))
-    width, height = fit_size(usual.width, usual.height, trained.max_size)
+    # a tour is for people: as large as the frames, not as what was trained on
+    most = TOUR_SIZE if request.path == TOUR else trained.max_size
+    width, height = fit_size(usual.width, usual.height, most)
     return CameraPath(viewmats, np.full(count, fov), width, height)
 
 

@@ -26,10 +26,10 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from recon_cli.errors import ConfigError
-from recon_cli.flythrough.paths import visible_depths
 from recon_cli.flythrough.request import ALPHA, DEPTH, RGB, TRUST
 from recon_cli.io.images import read_image, to_uint8, write_png
 from recon_cli.render import RenderOutput
+from recon_cli.scene.camera_paths import visible_depths
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.trust.heat_map import error_steps, heat_colors

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from recon_cli.errors import ConfigError
 
-TRAINING, ORBIT = "training", "orbit"  # values of --path besides a file
+TRAINING, ORBIT, TOUR = "training", "orbit", "tour"  # values of --path besides a file
 RGB, DEPTH, ALPHA, TRUST = OUTPUTS = ("rgb", "depth", "alpha", "trust")
 PNG, MP4 = FORMATS = ("png", "mp4")
 FPS, SECONDS = 30.0, 10.0  # defaults
+TOUR_SECONDS, TOUR_SIZE = 60.0, 1280  # of a tour
 _CRF_LIMITS = {"h264": 51, "av1": 63}
 CODECS = tuple(_CRF_LIMITS)
 CRF = {"h264": 18, "av1": 28}  # hardly a difference to the eye
@@ -22,12 +23,12 @@ MAX_FRAMES = 100_000
 class RenderRequest:
     """The options of the command; ConfigError if one is out of range, or two exclude each other."""
 
-    path: str = TRAINING  # "training", "orbit" or a .json with cameras
+    path: str = TRAINING  # "training", "orbit", "tour" or a .json with cameras
     views: tuple[str, ...] = ()  # test, train, validation or names of frames, instead of a path
     outputs: tuple[str, ...] = (RGB,)  # of rgb, depth, alpha, trust
     model: str = "auto"  # auto, base or pruned
     fps: float | None = None  # None takes that of the file, or 30
-    seconds: float | None = None  # length of a path that is made here; None is 10
+    seconds: float | None = None  # length of a path that is made here; None is 10, of a tour 60
     size: int | None = None  # longest side in pixels
     width: int | None = None  # without size, width and height: the size of training or the file
     height: int | None = None
@@ -38,9 +39,9 @@ class RenderRequest:
     out: Path | None = None  # folder, .mp4 or .png; None is a folder in the workspace
 
     def __post_init__(self) -> None:
-        if self.file is None and self.path not in (TRAINING, ORBIT):
+        if self.file is None and self.path not in (TRAINING, ORBIT, TOUR):
             raise ConfigError(
-                f"--path takes {TRAINING}, {ORBIT} or a FILE.json, but got {self.path!r}.",
+                f"--path takes {TRAINING}, {ORBIT}, {TOUR} or a FILE.json, but got {self.path!r}.",
                 hint="Give one of these; a file of cameras must end in .json.")
         self._check_numbers()
         self._check_views()
@@ -76,7 +77,8 @@ class RenderRequest:
 
     def frames(self) -> int:
         """Returns how many frames a path that is made here has."""
-        return max(1, round((self.fps or FPS) * (self.seconds or SECONDS)))
+        seconds = self.seconds or (TOUR_SECONDS if self.path == TOUR else SECONDS)
+        return max(1, round((self.fps or FPS) * seconds))
 
     def _check_numbers(self) -> None:
         for name, value, highest in (("fps", self.fps, 240), ("seconds", self.seconds, 86_400)):

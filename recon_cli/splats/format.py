@@ -51,6 +51,25 @@ class LoadedScene:
 
 
 @dataclass(frozen=True, eq=False)
+class Tour:
+    """A way through the scene that the page shows by itself."""
+
+    cameras: Sequence[Camera]  # at equal times, at least two; a spline joins them
+    # [C, 4] how far left, right, up and down of its middle each may show; its borders are at 1
+    margins: NDArray[np.float64]
+    seconds: float
+    start: int  # number of the camera that the page opens with
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """What a page shows by itself."""
+
+    tour: Tour
+    poster: bytes  # a .jpg of the view that it opens with
+
+
+@dataclass(frozen=True, eq=False)
 class WriteSettings:
     """Facts about a scene that a file can hold, and options; each format takes those it knows."""
 
@@ -58,6 +77,7 @@ class WriteSettings:
     antialiased: bool = False  # the scene was trained with antialiasing (Mip-Splatting)
     title: str = "scene"
     views: Sequence[tuple[str, Camera]] = ()  # training views by name
+    guide: Callable[[Splats], Guide | None] | None = None  # makes it, which takes seconds
     options: Mapping[str, Any] = field(default_factory=dict)  # those that the format's row names
     sharing: int = SHARING  # Gaussians per entry of a palette of colours, on the mean
 

@@ -14,10 +14,10 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePath
 from string import Template
 from typing import Any
 
@@ -28,12 +28,21 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import turn_from
-from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
+from recon_cli.splats.format import LoadedScene, SplatFormat, Tour, WriteSettings
 from recon_cli.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_scene
 from recon_cli.splats.values import read_contents
 from recon_cli.workspace.atomic import write_bytes
 
 View = tuple[str, Camera]
+_ICON = (
+    "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E%3Crect "
+    "width='32' height='32' rx='7' fill='%23223'/%3E%3Cellipse cx='12' cy='19' rx='8' ry='4' "
+    "fill='%23e8a33d' transform='rotate(-25 12 19)'/%3E%3Cellipse cx='20' cy='13' rx='8' ry='4' "
+    "fill='%234aa3df' fill-opacity='.85' transform='rotate(35 20 13)'/%3E%3C/svg%3E")
+_DESCRIPTION = "A place in 3D: look around in it."
+_PLAIN_TITLE = "A place in 3D"
+_CAMERA_NAME = re.compile(
+    r"(img|dsc[nf]?|pxl|vid|mov|mvi|gopr|gx|dji|p)?[-_ ]?[\d_-]{3,}", re.IGNORECASE)
 Z_UP: NDArray[np.float64] = np.array([0.0, 0, 1])
 
 # Files in `web/` by the module name that others import; "recon:" marks relative imports.
@@ -55,6 +64,17 @@ _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is
 # ten are a room, less than a millimetre.
 _MOST_HALVINGS = 5
 _DEFAULT_LENS = (1200, 900, 1000.0)  # width, height and focal length in pixels
+
+
+@dataclass(frozen=True, eq=False)
+class PageStyle:
+    """How a page looks besides its scene."""
+
+    title: str = "scene"
+    tour: Tour | None = None
+    poster: bytes | None = None  # a .jpg that is shown while the scene loads
+    preview: str | None = None  # address of the same picture, for links to the page
+    credits: bool = False  # whether it says what made it
 
 
 def measure_extent(means: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], float]:
@@ -81,34 +101,59 @@ def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
 
 
 def build_page(
-    title: str, scene: str, views: Sequence[View], splats: Splats, up: NDArray[np.float64]
+    style: PageStyle, scene: str, views: Sequence[View], splats: Splats, up: NDArray[np.float64]
 ) -> bytes:
     """Returns the page, in which `scene` is the element with the Gaussians."""
+    title = html.escape(style.title)
+    poster = "" if style.poster is None else (
+        '<img id="poster" alt="" src="data:image/jpeg;base64,'
+        f'{base64.b64encode(style.poster).decode("ascii")}">')
     text = Template(_text("page.html")).substitute(
-        title=html.escape(title), scene=scene, views=_views(views, splats, up),
+        title=title, preview=_preview(title, style.preview), icon=_ICON, poster=poster,
+        credits='<span id="credits">made with recon</span>' if style.credits else "",
+        scene=scene, views=_views(views, splats, up, style.tour),
         licences="\n".join(f"{name}\n{_text(name)}" for name in LICENCES),
         modules="\n".join(_module(name, file) for name, file in MODULES.items()))
     return text.encode("utf-8", "replace")  # a file name may hold surrogates
 
 
-def _views(views: Sequence[View], splats: Splats, up: NDArray[np.float64]) -> str:
-    """Returns the element with the extent of the scene and the cameras."""
+def _preview(title: str, picture: str | None) -> str:
+    """Returns what programs show of a link to the page (the Open Graph protocol)."""
+    lines = [f'<meta property="og:title" content="{title}">',
+             '<meta property="og:type" content="website">',
+             f'<meta property="og:description" content="{_DESCRIPTION}">']
+    if picture:
+        lines += [f'<meta property="og:image" content="{html.escape(picture)}">',
+                  '<meta name="twitter:card" content="summary_large_image">']
+    return "\n".join(lines)
+
+
+def _views(
+    views: Sequence[View], splats: Splats, up: NDArray[np.float64], tour: Tour | None
+) -> str:
+    """Returns the element with the extent of the scene, the cameras and the tour."""
     means = splats.means.detach().cpu().double().numpy()
     middle, reach = measure_extent(means)
     sample = means[::-(-len(means) // _DISTANCE_SAMPLES)]
     lenses: dict[tuple[float, ...], int] = {}
-    entries = []
-    for name, camera in views:
+
+    def entry(camera: Camera) -> dict[str, Any]:
         lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
         pose = np.hstack([camera.viewmat[:3, :3].T, camera.center[:, None]])
-        entries.append({
-            "name": name, "lens": lenses.setdefault(lens, len(lenses)),
-            "pose": pose.ravel().tolist(), "distance": _distance(sample, camera) or reach})
+        return {"lens": lenses.setdefault(lens, len(lenses)), "pose": pose.ravel().tolist(),
+                "distance": _distance(sample, camera) or reach}
+
+    entries = [entry(camera) for _, camera in views]  # file names are nobody's business
+    way = None if tour is None else {
+        "seconds": tour.seconds, "start": tour.start,
+        "views": [{**entry(camera), "margins": margins} for camera, margins in zip(
+            tour.cameras, tour.margins.tolist(), strict=True)]}
     names = ("fx", "fy", "cx", "cy", "width", "height")
     value = {
         "up": up.tolist(), "middle": middle.tolist(), "reach": reach,
         "lod": len(splats) >= _LEVELS_FROM,
-        "lenses": [dict(zip(names, lens, strict=True)) for lens in lenses], "views": entries}
+        "lenses": [dict(zip(names, lens, strict=True)) for lens in lenses], "views": entries,
+        "tour": way}
     # No name can close the element.
     text = json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return f'<script id="views" type="application/json">{text}</script>'
@@ -142,14 +187,14 @@ _CLOSED = b"</script>"
 
 
 def write_html(
-    path: Path, splats: Splats, *, title: str = "scene", up: NDArray[np.float64] = Z_UP,
-    views: Sequence[View] = (),
+    path: Path, splats: Splats, *, style: PageStyle | None = None,
+    up: NDArray[np.float64] = Z_UP, views: Sequence[View] = (),
 ) -> None:
-    """Writes a page that shows `splats`, whole or not at all.
+    """Writes a page that shows `splats`, completely or not at all.
 
     Values are quantized as by `write_spz`, but coefficients to 1/128. `up` is a unit vector [3]. A
-    visitor can step through the cameras of `views`; the page opens at the first of them, or in
-    front of the scene. The errors are those of `spz_bytes`.
+    visitor can step through the cameras of `views`; the page opens on its tour, at the first of
+    them, or in front of the scene. The errors are those of `spz_bytes`.
     """
     halvings = _halvings(splats)
     # beside the scripts size hardly counts
@@ -158,7 +203,8 @@ def write_html(
     tag = f' data-halvings="{halvings}"' if halvings else ""
     scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '
              f'data-bytes="{len(packed)}"{tag}>{base64.b64encode(packed).decode("ascii")}</script>')
-    write_bytes(path, build_page(title, scene, views or [default_view(splats, up)], splats, up))
+    write_bytes(path, build_page(
+        style or PageStyle(), scene, views or [default_view(splats, up)], splats, up))
 
 
 def _halvings(splats: Splats) -> int:
@@ -204,9 +250,26 @@ def read_html(path: Path) -> Splats:
 
 
 def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+    guide = settings.guide(splats) if settings.guide is not None else None
+    preview = path.with_suffix(".jpg")
+    if guide is not None:
+        write_bytes(preview, guide.poster)
+    style = PageStyle(
+        settings.options.get("title") or _find_title(settings.title),
+        guide.tour if guide else None, guide.poster if guide else None,
+        preview.name if guide else None, bool(settings.options.get("credits")))
     write_html(
-        path, splats.with_sphere(LARGEST_SCALE), title=settings.title,
+        path, splats.with_sphere(LARGEST_SCALE), style=style,
         up=Z_UP if settings.up is None else settings.up, views=settings.views)
+
+
+def _find_title(name: str) -> str:
+    """Returns a title from the name of a capture's file or folder, unless a camera made it up."""
+    stem = PurePath(name).stem
+    words = re.sub(r"[\s_-]+", " ", stem).strip()
+    if not words or _CAMERA_NAME.fullmatch(stem):
+        return _PLAIN_TITLE
+    return words[0].upper() + words[1:]
 
 
 FORMAT = SplatFormat(lambda path: LoadedScene(read_html(path)), _write_with)

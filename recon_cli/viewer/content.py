@@ -16,12 +16,12 @@ from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.evaluation.reference_views import render_view
-from recon_cli.flythrough.paths import visible_depths
 from recon_cli.flythrough.trained_scene import open_trained_scene
 from recon_cli.io.images import fit_camera, fit_size, read_image, read_masked_image, to_uint8
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera_paths import visible_depths
 from recon_cli.scene.scene import View
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import leaves_enough

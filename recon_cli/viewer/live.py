@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from recon_cli.context import TrainCallback, TrainReport
 from recon_cli.errors import ReconError
-from recon_cli.flythrough.paths import visible_depths
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera_paths import visible_depths
 from recon_cli.scene.gravity import mean_up
 from recon_cli.scene.splats import Splats
 from recon_cli.viewer.content import FAR, browser_camera, move_browser, set_initial_camera

@@ -68,7 +68,8 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("sog", "gaussians", "splats.sog", "recon_cli.splats.sog", options=("max_loss",),
                  sharing=_SHARING),
     ExportFormat("glb", "gaussians", "splats.glb", "recon_cli.splats.glb"),
-    ExportFormat("html", "gaussians", "splats.html", "recon_cli.splats.html"),
+    ExportFormat("html", "gaussians", "splats.html", "recon_cli.splats.html", more_files=(
+        "splats.jpg",), options=("title", "credits")),
     ExportFormat("lod", "gaussians", "lod/lod-meta.json", "recon_cli.splats.lod", more_files=(
         "lod/*",), options=("max_loss",), sharing=_SHARING),
     ExportFormat("points.ply", "points", "points.ply"),

@@ -160,7 +160,7 @@ def describe_changes(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -
         return "another version of recon wrote it"
     for key, value in now.items():
         had = before.get(key)
-        if had == value:
+        if had == value or (had is None and value is False):
             continue
         if key == "model":
             return f"it shows the {had} model"

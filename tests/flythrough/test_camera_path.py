@@ -7,7 +7,7 @@ import pytest
 
 from recon_cli.errors import FormatError
 from recon_cli.flythrough.camera_path import CameraPath, read_camera_path, write_camera_path
-from recon_cli.flythrough.paths import orbit_path
+from recon_cli.scene.camera_paths import orbit_path
 
 # a camera at (1, 2, 3) that looks along +y with z up, as OpenGL has it: the columns are right (x),
 # up (z) and backward (-y)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from recon_cli.flythrough.paths import find_look_at, orbit_path
 from recon_cli.scene.camera import Camera, looking_at
+from recon_cli.scene.camera_paths import find_look_at, orbit_path
 
 UPS = [np.array([0.0, 0, 1]), np.array([0.0, -1, 0]), np.array([2.0, -1, 2]) / 3]
 

@@ -8,7 +8,7 @@ from recon_cli.errors import ConfigError
 from recon_cli.flythrough.request import RenderRequest
 
 BAD = [
-    ({"path": "trainnig"}, "training, orbit or a FILE.json"),
+    ({"path": "trainnig"}, "training, orbit, tour or a FILE.json"),
     ({"fps": 0.0}, "--fps is 0"),
     ({"fps": float("nan")}, "--fps is nan"),
     ({"seconds": -1.0}, "--seconds is -1"),

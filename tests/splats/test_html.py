@@ -18,7 +18,8 @@ from splat_cases import damaged, read_or_refused
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.splats.axes import turn_from
-from recon_cli.splats.html import default_view, read_html, write_html
+from recon_cli.splats.format import Tour
+from recon_cli.splats.html import PageStyle, _find_title, default_view, read_html, write_html
 from recon_cli.splats.spz import load_spz, spz_bytes
 
 Y_DOWN = np.array([0.0, -1, 0])
@@ -35,7 +36,8 @@ def camera(x: float = 0.0) -> Camera:
 def written(tmp_path):
     """A page of 40 Gaussians of degree 3 with two cameras."""
     path = tmp_path / "a.html"
-    write_html(path, room(40), title="room", up=Y_DOWN, views=[("a", camera()), ("b", camera(1.0))])
+    write_html(path, room(40), style=PageStyle("room"), up=Y_DOWN,
+               views=[("a", camera()), ("b", camera(1.0))])
     return path
 
 
@@ -99,7 +101,7 @@ def test_a_scene_with_gaussians_too_large_for_spz_is_halved_and_read_back_as_it_
 
 def test_the_same_scene_gives_the_same_bytes(tmp_path):
     for name in ("a.html", "b.html"):
-        write_html(tmp_path / name, room(40), title="x", views=[("v", camera())])
+        write_html(tmp_path / name, room(40), style=PageStyle("x"), views=[("v", camera())])
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
@@ -117,26 +119,26 @@ def test_the_licences_of_what_is_in_the_page_are_in_the_page(written):
 
 def test_no_name_can_add_an_element_or_a_scene(tmp_path):
     plain, hostile = tmp_path / "plain.html", tmp_path / "hostile.html"
-    write_html(plain, room(40), title="room", views=[("view", camera())])
-    write_html(hostile, room(40), title=HOSTILE, views=[(HOSTILE, camera())])
+    write_html(plain, room(40), style=PageStyle("room"), views=[("view", camera())])
+    write_html(hostile, room(40), style=PageStyle(HOSTILE), views=[(HOSTILE, camera())])
     tags = [[(tag, sorted(attributes)) for tag, attributes, _ in
              Elements(path.read_text(encoding="utf-8")).found] for path in (plain, hostile)]
     assert tags[0] == tags[1]
     [(_, title)] = Elements(hostile.read_text(encoding="utf-8")).of("title")
     assert title.rstrip("\n") == HOSTILE
-    assert told(hostile)["views"][0]["name"] == HOSTILE
     assert len(read_html(hostile)) == 40
 
 
 def test_a_name_that_is_no_text_becomes_some(tmp_path):
-    write_html(tmp_path / "a.html", room(9), title="a\udcff", views=[("b\udcff", camera())])
+    write_html(
+        tmp_path / "a.html", room(9), style=PageStyle("a\udcff"), views=[("b\udcff", camera())])
     [(_, title)] = Elements((tmp_path / "a.html").read_text(encoding="utf-8")).of("title")
     assert title.startswith("a?")
 
 
 def test_a_viewer_is_told_each_camera_exactly_and_each_lens_once(written):
     value = told(written)
-    assert [view["name"] for view in value["views"]] == ["a", "b"]
+    assert len(value["views"]) == 2
     assert value["lenses"] == [
         {"fx": 150.0, "fy": 160.0, "cx": 98.0, "cy": 53.0, "width": 200, "height": 100}]
     pose = np.array(value["views"][1]["pose"]).reshape(3, 4)
@@ -259,3 +261,46 @@ def test_a_damaged_page_gives_gaussians_or_a_format_error(tmp_path_factory, seed
     start = text.index(b'<script id="scene"')
     end = text.index(b"</script>", start)
     read_or_refused(read_html, path, damaged(text[start:end + 9], seed))
+
+
+def test_names_of_files_are_not_in_the_page(tmp_path):
+    write_html(tmp_path / "a.html", room(9), views=[("IMG_0042.jpg", camera())])
+    assert b"IMG_0042" not in (tmp_path / "a.html").read_bytes()
+
+
+def test_a_page_has_a_picture_and_tells_programs_of_links_where_it_lies(tmp_path):
+    picture = b"\xff\xd8 a picture"
+    write_html(tmp_path / "a.html", room(9), style=PageStyle(
+        "a <room>", poster=picture, preview="a.jpg"))
+    elements = Elements((tmp_path / "a.html").read_text(encoding="utf-8"))
+    [(image, _)] = elements.of("img")
+    assert base64.b64decode(image["src"].split(",")[1]) == picture
+    said = {attributes["property"]: attributes["content"]
+            for attributes, _ in elements.of("meta") if "property" in attributes}
+    assert (said["og:title"], said["og:image"]) == ("a <room>", "a.jpg")
+
+
+@pytest.mark.parametrize("credits", [True, False])
+def test_credits_are_shown_where_they_are_wanted(tmp_path, credits):
+    write_html(tmp_path / "a.html", room(9), style=PageStyle(credits=credits))
+    found = Elements((tmp_path / "a.html").read_text(encoding="utf-8")).of("span", id="credits")
+    assert len(found) == credits
+
+
+def test_a_tour_is_told_place_by_place(tmp_path):
+    margins = np.array([[1, 1.5, 1, 1], [1, 1, 1.25, 2]])
+    write_html(tmp_path / "a.html", room(40), up=Y_DOWN, views=[("a", camera())], style=PageStyle(
+        tour=Tour([camera(), camera(2.0)], margins, seconds=7.5, start=1)))
+    tour = told(tmp_path / "a.html")["tour"]
+    assert (tour["seconds"], tour["start"]) == (7.5, 1)
+    assert [view["margins"] for view in tour["views"]] == margins.tolist()
+    assert [view["pose"][3] for view in tour["views"]] == [0, 2]
+
+
+@pytest.mark.parametrize(("name", "title"), [
+    ("living_room.mp4", "Living room"), ("my-flat", "My flat"), ("kitchen 2.mov", "Kitchen 2"),
+    ("IMG_4711.MOV", "A place in 3D"), ("20260314_101500.mp4", "A place in 3D"),
+    ("PXL_20260314_101500123.mp4", "A place in 3D"), ("DSC00042.JPG", "A place in 3D"),
+])
+def test_a_title_is_made_of_a_name_that_somebody_gave(name, title):
+    assert _find_title(name) == title

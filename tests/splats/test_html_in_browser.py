@@ -19,7 +19,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import joined, transformed
 from recon_cli.splats import html
-from recon_cli.splats.html import read_html, write_html
+from recon_cli.splats.html import PageStyle, Tour, read_html, write_html
 
 WIDTH, HEIGHT = 240, 180
 Y_DOWN = np.array([0.0, -1, 0])
@@ -40,7 +40,7 @@ def cameras() -> list[Camera]:
 
 def made(path: Path, degree: int = 3, count: int = 3000, title: str = "room") -> Path:
     """Writes a page of a made room with the three cameras."""
-    write_html(path, room(count, degree=degree), title=title, up=Y_DOWN,
+    write_html(path, room(count, degree=degree), style=PageStyle(title), up=Y_DOWN,
                views=[(f"{i}.png", camera) for i, camera in enumerate(cameras())])
     return path
 
@@ -54,7 +54,8 @@ def opened(page: WatchedPage, path: Path, *, hash: str = "") -> None:
 
 def picture(page: WatchedPage) -> np.ndarray:
     """What the settled page shows without its buttons, [H, W, 3] in [0, 1]."""
-    page.page.add_style_tag(content="footer { visibility: hidden }")
+    page.page.add_style_tag(
+        content="header, footer { visibility: hidden } #poster { display: none }")
     page.page.evaluate("recon.settled()")
     png = Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
     return np.asarray(png).astype(np.float64) / 255
@@ -148,25 +149,26 @@ def test_buttons_keys_and_the_address_choose_the_camera(page, tmp_path):
     path = made(tmp_path / "a.html")
     opened(page, path, hash="#view=3")
     assert nearest(page, path) == 3
-    button = {name: page.page.locator(f"#{name}") for name in ("before", "after", "reset", "name")}
+    button = {name: page.page.locator(f"#{name}") for name in (
+        "before", "after", "reset", "number")}
     page.page.add_style_tag(content="footer { visibility: visible !important }")
-    assert button["name"].inner_text() == "3/3 2.png"
+    assert button["number"].inner_text() == "3/3"
     button["before"].click()
-    assert button["name"].inner_text() == "2/3 1.png"
+    assert button["number"].inner_text() == "2/3"
     for _ in range(2):
         button["after"].click()
-    assert button["name"].inner_text() == "1/3 0.png"  # behind the last comes the first
+    assert button["number"].inner_text() == "1/3"  # behind the last comes the first
     page.page.keyboard.press("p")
-    assert button["name"].inner_text() == "3/3 2.png"
+    assert button["number"].inner_text() == "3/3"
     page.page.keyboard.press("n")
     page.page.keyboard.press("n")
-    assert button["name"].inner_text() == "2/3 1.png"
+    assert button["number"].inner_text() == "2/3"
     page.page.evaluate("location.hash = '#view=1'")
     page.page.wait_for_timeout(50)
-    assert button["name"].inner_text() == "1/3 0.png"
+    assert button["number"].inner_text() == "1/3"
     button["after"].click()
     button["reset"].click()
-    assert button["name"].inner_text() == "1/3 0.png"
+    assert button["number"].inner_text() == "1/3"
     page.page.evaluate("document.querySelector('footer').remove()")
     assert nearest(page, path) == 1
     page.assert_silent()
@@ -251,7 +253,7 @@ def test_it_fits_a_phone(page, tmp_path):
     page.page.set_viewport_size({"width": 360, "height": 640})
     page.page.evaluate("recon.settled()")
     assert page.page.evaluate("document.documentElement.scrollWidth") == 360
-    for name in ("reset", "mode", "before", "after"):
+    for name in ("reset", "mode", "before", "after", "ask"):
         box = page.page.locator(f"#{name}").bounding_box()
         assert box["x"] >= 0
         assert box["x"] + box["width"] <= 360
@@ -260,6 +262,66 @@ def test_it_fits_a_phone(page, tmp_path):
     canvas = page.page.locator("canvas").bounding_box()
     assert (canvas["width"], canvas["height"]) == (360, 640)
     page.assert_silent()
+
+
+def toured(path: Path) -> Path:
+    """Writes a page with a tour of ten seconds through the first two cameras, from the second."""
+    tour = Tour(cameras()[:2], np.ones((2, 4)), seconds=10.0, start=1)
+    write_html(path, room(3000), up=Y_DOWN, style=PageStyle("room", tour),
+               views=[(f"{i}.png", camera) for i, camera in enumerate(cameras())])
+    return path
+
+
+def test_a_page_opens_where_its_tour_starts_and_returns_there(page, tmp_path):
+    path = toured(tmp_path / "a.html")
+    opened(page, path)
+    assert nearest(page, path) == 2
+    page.page.evaluate("recon.tour(0)")
+    assert nearest(page, path) == 1
+    page.page.keyboard.press("r")
+    assert nearest(page, path) == 2
+    page.assert_silent()
+
+
+def test_a_tour_plays_until_the_visitor_takes_the_camera(page, tmp_path):
+    opened(page, toured(tmp_path / "a.html"))
+    page.page.evaluate("recon.tour(0)")
+    first = picture(page)
+    page.page.add_style_tag(content="footer { visibility: visible !important }")
+    play = page.page.locator("#play")
+    play.click()
+    page.page.wait_for_timeout(1500)
+    assert play.get_attribute("aria-pressed") == "true"
+    page.page.mouse.move(120, 60)
+    page.page.mouse.down()
+    page.page.mouse.up()
+    assert play.get_attribute("aria-pressed") == "false"
+    stopped = picture(page)
+    assert psnr_db(first, stopped) < 40  # it has gone on
+    page.page.wait_for_timeout(500)
+    assert psnr_db(stopped, picture(page)) > 45
+    page.page.add_style_tag(content="footer { visibility: visible !important }")
+    speed = page.page.locator("#speed")
+    said = []
+    for _ in range(3):
+        speed.click()
+        said.append(speed.inner_text())
+    assert [text[0] for text in said] == ["2", "½", "1"]
+    page.assert_silent()
+
+
+def test_a_tall_window_shows_no_more_than_views_have_seen(page, tmp_path):
+    """Of a margin of one the picture fills the window; of two there is as much above as in it."""
+    for margin in (1.0, 2.0):
+        tour = Tour(cameras()[:2], np.full((2, 4), margin), seconds=10.0, start=0)
+        write_html(tmp_path / "a.html", room(100), up=Y_DOWN, style=PageStyle("room", tour))
+        opened(page, tmp_path / "a.html")
+        page.page.set_viewport_size({"width": 200, "height": 600})
+        page.page.evaluate("recon.settled()")
+        down = page.page.evaluate("recon.degreesDown()")
+        whole = np.sqrt(WIDTH / 200 * HEIGHT / 600) * 600  # without any limit
+        shown = min(whole, margin * HEIGHT)
+        assert down == pytest.approx(2 * np.degrees(np.arctan(shown / 2 / 200.0)), abs=0.01)
 
 
 def test_while_it_loads_the_page_says_so(page, tmp_path):
@@ -271,7 +333,7 @@ def test_while_it_loads_the_page_says_so(page, tmp_path):
         }).observe(document, {childList: true, subtree: true, characterData: true});""")
     opened(page, made(tmp_path / "a.html", 0, 50))
     said = page.page.evaluate("said")
-    assert said[0].startswith("Loading room")
+    assert said[0].startswith("Loading")
     assert said[-1] == ""
 
 

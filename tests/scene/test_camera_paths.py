@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import Rotation
 
-from recon_cli.flythrough.paths import orbit_path, smooth_path
 from recon_cli.scene.camera import looking_at
+from recon_cli.scene.camera_paths import orbit_path, smooth_path
 
 pytestmark = pytest.mark.floors
 

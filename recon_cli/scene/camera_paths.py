@@ -1,4 +1,4 @@
-"""Camera paths: a smooth path through the cameras of a hand-held capture, and an orbit.
+"""Camera paths: a smooth path through the cameras of a capture, a tour, and an orbit.
 
 The camera centres are the control points of a cubic B-spline. It stays within their convex hull, so
 the path inside a room leaves through no wall, but cuts corners and misses the centres themselves.
@@ -23,17 +23,26 @@ _SHARE, _MOST = 1 / 40, 3.0
 _MEAN_MIN = 0.5  # length of a mean quaternion, below which rotations are too far apart to have one
 _FINE = 64  # steps from camera to camera along which lengths are measured
 _FASTER = 2.0  # times the mean turn rate of the view, above which the path slows down
+# A tour is calmer than the hand that filmed, and nobody feels hurried or sick in it.
+_CALM = 2.0  # times the filter of a path
+_TURN = np.radians(15.0)  # a second, on average
+_WALK = 0.2  # of the distance to what is seen, a second, on average
+_SHORTEST, _LONGEST = 20.0, 180.0  # seconds
+# Photos in no order: another order makes their path shorter than this share of the one by name.
+_SHORTER = 0.6
 
 
-def smooth_path(viewmats: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def smooth_path(
+    viewmats: NDArray[np.float64], count: int, *, calm: float = 1.0
+) -> NDArray[np.float64]:
     """Returns `count` cameras [count, 4, 4] along a smooth path through cameras, at constant speed.
 
     Where the view would turn faster than twice its mean rate, the path slows down. `viewmats` [C,
-    4, 4] are world to camera, OpenCV axes, in the order of the path; its ends are kept.
+    4, 4] are world to camera, OpenCV axes, in the order of the path; its ends are kept. `calm`
+    widens the filter.
     """
-    rotations = viewmats[:, :3, :3].transpose(0, 2, 1)
-    centers = -np.einsum("cij,cj->ci", rotations, viewmats[:, :3, 3])
-    curve, last = _fit_spline(centers, rotations)
+    rotations, centers = _poses(viewmats)
+    curve, last = _fit_spline(centers, rotations, calm)
     fine = np.linspace(0, last, int(_FINE * last) + 1)
     length = _path_length(*_split(curve(fine)))
     at = np.interp(np.linspace(0, length[-1], count), length, fine)
@@ -44,12 +53,63 @@ def smooth_path(viewmats: NDArray[np.float64], count: int) -> NDArray[np.float64
     return smooth
 
 
+def tour_path(viewmats: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Returns `count` cameras [count, 4, 4] of a quiet tour along the path of a capture.
+
+    Cameras of photos that were taken in no order are put into one first.
+    """
+    return smooth_path(viewmats[order_cameras(viewmats)], count, calm=_CALM)
+
+
+def tour_seconds(path: NDArray[np.float64], distance: float) -> float:
+    """Returns how long a tour along `path` [count, 4, 4] takes at an easy pace.
+
+    `distance` is to what is seen, in world units.
+    """
+    rotations, centers = _poses(path)
+    turns = Rotation.from_matrix(rotations)
+    angle = float((turns[:-1].inv() * turns[1:]).magnitude().sum())
+    way = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    seconds = max(angle / _TURN, way / (_WALK * max(distance, 1e-12)))
+    return float(np.clip(seconds, _SHORTEST, _LONGEST))
+
+
+def order_cameras(viewmats: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns the order [C] of a path through cameras [C, 4, 4]: the given one where it is short.
+
+    The steps of another order are those to the nearest camera that is left, by its place and its
+    direction of view.
+    """
+    rotations, centers = _poses(viewmats)
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()) or 1.0
+    places = np.concatenate([centers / spread, rotations[:, :, 2]], axis=1)
+    count = len(places)
+    order, left = [0], np.ones(count, bool)
+    left[0] = False
+    for _ in range(count - 1):
+        steps = np.where(left, np.linalg.norm(places - places[order[-1]], axis=1), np.inf)
+        order.append(int(steps.argmin()))
+        left[order[-1]] = False
+    lengths = [float(np.linalg.norm(np.diff(places[way], axis=0), axis=1).sum())
+               for way in (np.arange(count), order)]
+    return np.array(order) if lengths[1] < _SHORTER * lengths[0] else np.arange(count)
+
+
+def _poses(
+    viewmats: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns camera-to-world rotations [C, 3, 3] and centres [C, 3]."""
+    rotations = viewmats[:, :3, :3].transpose(0, 2, 1)
+    return rotations, -np.einsum("cij,cj->ci", rotations, viewmats[:, :3, 3])
+
+
 def _fit_spline(
     centers: NDArray[np.float64],  # [C, 3]
     rotations: NDArray[np.float64],  # [C, 3, 3]
+    calm: float,
 ) -> tuple[BSpline, float]:
     """Returns the curve of centres and quaternions, [7] each, and the parameter of its end."""
-    sigma = min(_SHARE * len(centers), _MOST)
+    sigma = calm * min(_SHARE * len(centers), _MOST)
     quats = _align_signs(Rotation.from_matrix(rotations).as_quat())
     mean = gaussian_filter1d(quats, sigma, axis=0, mode="nearest")
     length = np.linalg.norm(mean, axis=1, keepdims=True)
