@@ -176,7 +176,7 @@ class TrainConfig(StageConfig):
         "budget", "Add Gaussians where the error is (budget) or as 3DGS does (reference).",
         choices=("budget", "reference"))
     iterations: int | None = option(
-        None, "Optimization steps; a higher number than a finished run continues that run.",
+        None, "Optimization steps; more than a finished run took continue it.",
         minimum=1, automatic="by --quality")
     batch_views: int = option(
         1, "Views per step; their mean gradient is used.", unit="views", minimum=1,

@@ -121,7 +121,7 @@ def test_every_form_holds_the_figures(room, capsys):
     text = compared(capsys, room / "a")
     assert shown in text
     assert "difference, 95%" in text
-    assert "PSNR base" in text  # both models are there: the paper's table
+    assert "PSNR original" in text  # both models are there: the paper's table
     assert f"| {shown} |" in compared(capsys, room / "a", "--form", "markdown")
     assert r"\begin{tabular}" in compared(capsys, room / "a", "--form", "latex")
     lines = compared(capsys, room / "a", "--form", "csv").splitlines()
