@@ -63,5 +63,5 @@ def test_masks_by_stem_are_found_in_data_sets_of_every_layout(tmp_path, layout):
 def test_where_no_mask_fits_the_right_name_is_told(tmp_path):
     posed_sets.make_transforms(tmp_path)
     touch(tmp_path / "masks" / "mask_0.png")
-    assert any("mask of 0000.png must be called 0000.png.png or 0000.png" in notice
+    assert any("0000.png must be called 0000.png.png or 0000.png" in notice
                for notice in read_posed(tmp_path).notices)

@@ -18,6 +18,7 @@ from recon_cli.config.stages import ExportConfig, RunConfig, read_matrix
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
+from recon_cli.io.training_scene import load_scene
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
@@ -25,7 +26,7 @@ from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
 from recon_cli.splats.registry import read_splats
 from recon_cli.splats.spz import load_spz, unpack
 from recon_cli.stages import export
-from recon_cli.train.train_data import write_config
+from recon_cli.train.train_data import read_config, write_config
 from recon_cli.workspace.atomic import write_json
 
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])
@@ -200,16 +201,13 @@ def test_a_page_stands_upright_in_any_frame(inputs):
     start = text.index(">", text.index('<script id="views"')) + 1
     value = json.loads(text[start:text.index("</script>", start)])
     assert np.allclose(value["up"], TURN @ [0, 0, 1])
-    frames = json.loads((inputs.folders["ingest"] / "frames.json").read_text())["frames"]
-    assert [view["name"] for view in value["views"]] == sorted(
-        {view["name"] for view in value["views"]} - {
-            frame["name"] for frame in frames if frame["held_out"]})
-    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
-    for view in value["views"]:
+    scene = load_scene(inputs.folders, validation=read_config(inputs.folders["train"]).validation)
+    cameras = of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse")
+    train = sorted(view.name for view in scene.train)
+    for view, name in zip(value["views"], train, strict=True):
         pose = np.array(view["pose"]).reshape(3, 4)
-        center = of_colmap(sparse)[view["name"]].center
-        assert np.allclose(pose[:, 3], MOVED.points(center))
-    assert "<title>tiny.mp4</title>" in text
+        assert np.allclose(pose[:, 3], MOVED.points(cameras[name].center))
+    assert "<title>Tiny</title>" in text
 
 
 BAD = {

@@ -43,7 +43,7 @@ def train_of(workspace):
 
 def test_a_scene_is_fresh_and_says_where_it_comes_from(alone, scene, capsys):
     assert states(alone)["train"] == "fresh"
-    assert recon_status(alone, capsys).count("imported from scene.ply, format ply") == 1
+    assert recon_status(alone, capsys).count("Gaussians from scene.ply") == 1
     manifest = json.loads((alone / "train" / "manifest.json").read_text())
     (source,) = manifest["inputs"]
     assert source["files"]["scene.ply"]["sha256"] == digest_file(scene).sha256

@@ -156,7 +156,7 @@ def test_parts_that_hold_too_few_frames_together_are_refused(base, tmp_path):
 
 def test_the_notices_name_each_part_and_how_to_take_another_one(mapped, base, tmp_path, caplog):
     run(base, tmp_path / "out", earlier=result_of(mapped), part=2)
-    for facts in (("2 parts", "this is part 2"), ("recon sfm --part 1", "recon report"),
+    for facts in (("2 parts", "part 2 is used"), ("recon sfm --part 1", "recon report"),
                   ("Part 1", f"{LARGE} of 44 frames", "000000.png to 000023.png (0.0 to 11.5 s)"),
                   ("Part 2", f"{SMALL} of 44 frames", "000024.png to 000043.png")):
         assert_facts(caplog.text, *facts)
