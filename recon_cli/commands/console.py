@@ -70,7 +70,6 @@ class Log(logging.StreamHandler[TextIO]):
         self._style, self._complete = style, complete
         self.notices: list[str] = []
         self.outcomes: list[Outcome] = []
-        self.files: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
         """Writes a record on a line of its own; the outcome of a stage is a line of stdout."""
@@ -79,7 +78,6 @@ class Log(logging.StreamHandler[TextIO]):
             self.outcomes.append(outcome)
         elif record.levelno == logging.WARNING:
             self.notices.append(self._complete(record.getMessage()))
-        self.files += getattr(record, "files", ())
         if not self._is_shown(record):
             return
         with hide_bars():
@@ -183,8 +181,7 @@ def result_object(
               for outcome in log.outcomes]
     files = [f"{outcome.stage}/{name}" for outcome in log.outcomes if outcome.ran
              for name in outcome.manifest.outputs]
-    return json.dumps({**fields, "stages": stages, "files": [*files, *log.files],
-                       "notices": log.notices, "output": output}, indent=1)
+    return json.dumps({**fields, "stages": stages, "files": files, "notices": log.notices, "output": output}, indent=1)
 
 
 def usage_hint(error: click.ClickException) -> str:
