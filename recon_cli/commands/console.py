@@ -181,7 +181,8 @@ def result_object(
               for outcome in log.outcomes]
     files = [f"{outcome.stage}/{name}" for outcome in log.outcomes if outcome.ran
              for name in outcome.manifest.outputs]
-    return json.dumps({**fields, "stages": stages, "files": files, "notices": log.notices, "output": output}, indent=1)
+    return json.dumps({**fields, "stages": stages, "files": files, "notices": log.notices,
+                       "output": output}, indent=1)
 
 
 def usage_hint(error: click.ClickException) -> str:
