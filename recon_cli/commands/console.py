@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from recon_cli.pipeline.plan import Outcome
 
 LOG_FORMATS = ("auto", "bars", "lines", "json")
+_MOST_LINES = 4  # of a stage in a minute, without notices
+_MINUTE = 60.0
 
 logger = logging.getLogger("recon")
 
@@ -70,6 +72,7 @@ class Log(logging.StreamHandler[TextIO]):
         self._style, self._complete = style, complete
         self.notices: list[str] = []
         self.outcomes: list[Outcome] = []
+        self._shown: dict[str, list[float]] = {}  # when lines of each stage were written
 
     def emit(self, record: logging.LogRecord) -> None:
         """Writes a record on a line of its own; the outcome of a stage is a line of stdout."""
@@ -78,7 +81,7 @@ class Log(logging.StreamHandler[TextIO]):
             self.outcomes.append(outcome)
         elif record.levelno == logging.WARNING:
             self.notices.append(self._complete(record.getMessage()))
-        if not self._is_shown(record):
+        if not self._is_shown(record) or not (outcome or self._has_room(record)):
             return
         with hide_bars():
             if outcome and not self._style.as_object:
@@ -91,6 +94,16 @@ class Log(logging.StreamHandler[TextIO]):
             return record.levelno >= logging.ERROR
         return record.levelno >= logging.INFO or self._style.verbose or (
             self._style.form == "json" and hasattr(record, "event"))
+
+    def _has_room(self, record: logging.LogRecord) -> bool:
+        """Returns whether a line is one of the few that a stage writes in a minute."""
+        stage = progress.current_stage()
+        if not stage or self._style.form != "lines" or self._style.verbose:
+            return True
+        times = [one for one in self._shown.get(stage, ()) if record.created - one < _MINUTE]
+        fits = len(times) < _MOST_LINES or record.levelno >= logging.WARNING
+        self._shown[stage] = [*times, record.created] if fits else times
+        return fits
 
     def format(self, record: logging.LogRecord) -> str:
         """Returns a line of text or JSON; `notice:` stands before warnings."""

@@ -1,6 +1,7 @@
 """What scripts and servers rely on: the log's formats, --quiet, --json, variables, devices."""
 
 import json
+import logging
 import os
 import re
 from pathlib import Path
@@ -62,6 +63,22 @@ def test_without_a_terminal_each_line_of_the_log_has_the_time(capsys: Said) -> N
     err = capsys.readouterr().err
     assert "\r" not in err
     assert all(LOG_LINE.match(line) for line in err.splitlines())
+
+
+def test_a_stage_that_says_much_writes_four_lines_a_minute_and_every_notice(capsys: Said) -> None:
+    def say_much() -> None:
+        for number in range(9):
+            logging.getLogger("recon").info("fact %d", number)
+        logging.getLogger("recon").warning("a frame is dark")
+
+    fake_stages.actions["ingest"] = say_much
+    assert main(["ingest", "room.mp4"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 5
+    assert lines[-1].endswith("notice: a frame is dark")
+    assert "fact 8" in Path("workspace/recon.log").read_text()
+    assert main(["ingest", "--again", "-v"]) == 0
+    assert "fact 8" in capsys.readouterr().err
 
 
 def test_the_log_as_json_has_the_same_fields_in_every_line(capsys: Said) -> None:
