@@ -7,7 +7,7 @@ import os
 import sys
 
 from recon_cli import signals
-from recon_cli.processes import CHILD, end_with_parent, protect_children
+from recon_cli.processes import CHILD, end_with_parent, forget_options, protect_children
 
 
 def main() -> int:
@@ -16,6 +16,7 @@ def main() -> int:
         try:
             if os.environ.pop(CHILD, ""):
                 end_with_parent()
+                forget_options()
             protect_children()
             if isinstance(sys.stdout, io.TextIOWrapper):  # a file name need not be UTF-8
                 sys.stdout.reconfigure(errors="backslashreplace")

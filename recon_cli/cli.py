@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import sys
+import time
 from collections import UserDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -15,7 +17,8 @@ import click
 
 from recon_cli import __version__, signals
 from recon_cli.commands import console, hints
-from recon_cli.commands.options import Call
+from recon_cli.commands.console import CapturedOutput, Failure, Log
+from recon_cli.commands.options import Call, complete, used_variables
 from recon_cli.errors import ExitCode, ReconError, ReconstructionError
 from recon_cli.workspace import disk
 
@@ -61,7 +64,7 @@ class _LazyCommands(UserDict[str, Any]):
         module, _, name = (HIDDEN.get(verb) or VERBS[verb][0]).partition(".")
         command: click.Command = getattr(
             importlib.import_module(f"recon_cli.commands.{module}"), name)
-        return command
+        return command if verb in HIDDEN else complete(command, verb)
 
 
 class _LazyGroup(click.Group):
@@ -86,7 +89,8 @@ class _LazyGroup(click.Group):
 
 @click.group(
     cls=_LazyGroup, commands=_LazyCommands(dict.fromkeys((*VERBS, *HIDDEN))),
-    context_settings={"max_content_width": MAX_WIDTH})
+    context_settings={
+        "max_content_width": MAX_WIDTH, "help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="recon")
 def cli() -> None:
     """Turn a video or photos of a room into a 3D Gaussian Splatting scene."""
@@ -105,45 +109,94 @@ def _default_workspace(verb: str) -> str | None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit code."""
+    words, stdout, begin = list(sys.argv[1:] if arguments is None else arguments), sys.stdout, (
+        time.monotonic())
     call = Call()
 
-    def complete(text: str) -> str:
+    def complete_commands(text: str) -> str:
         return hints.name_workspace(text, call.workspace, _default_workspace)
 
-    handler = console.show_log(detailed=lambda: call.verbose, complete=complete)
+    with console.show_log(call, complete=complete_commands) as log:
+        failure, code = None, int(ExitCode.DONE)
+        error: BaseException | None = None
+        try:
+            with signals.raising():
+                ended = cli.main(words, prog_name="recon", standalone_mode=False, obj=call)
+                code = ended if isinstance(ended, int) else code
+        except (Exception, KeyboardInterrupt) as raised:
+            error = (raised.__cause__ if isinstance(raised, _PastClick) else None) or raised
+            code = _exit_code(error)
+            with suppress(OSError):  # of a stderr that nobody reads, or on the disk that is full
+                failure = _tell(error, log, _verb(words), complete_commands)
+        output, sys.stdout = sys.stdout, stdout
+        if call.as_object or (failure and _asks_for_object(error, words)):
+            lines = output.lines if isinstance(output, CapturedOutput) else []
+            known = call.as_object and _default_workspace(_verb(words))
+            code = _print_object(console.result_object(
+                _verb(words), str(call.workspace.absolute()) if known else None, log, lines,
+                time.monotonic() - begin, failure), code)
+        return code
+
+
+def _verb(words: Sequence[str]) -> str:
+    """Returns the verb that was typed; empty where none was."""
+    return next((word for word in words if word in VERBS), "")
+
+
+def _asks_for_object(error: BaseException | None, words: Sequence[str]) -> bool:
+    """Returns whether a command line that could not be parsed asks for --json's object."""
+    ctx = error.ctx if isinstance(error, click.UsageError) else None
+    return ctx is not None and "--json" in words and any(
+        option.name == "as_object" for option in ctx.command.params)
+
+
+def _print_object(text: str, code: int) -> int:
+    """Prints the object of --json and returns the exit code."""
     try:
-        with signals.raising():
-            code = cli.main(arguments, prog_name="recon", standalone_mode=False, obj=call)
-            return code if isinstance(code, int) else ExitCode.DONE
-    except (Exception, KeyboardInterrupt) as raised:
-        error = raised.__cause__ or raised if isinstance(raised, _PastClick) else raised
-        with suppress(OSError):  # of a stderr that nobody reads, or on the disk that is full
-            return _tell(error, complete)
-        return _exit_code(error)
-    finally:
-        logger.removeHandler(handler)
-
-
-def _tell(error: BaseException, complete: Callable[[str], str]) -> int:
-    """Prints why a command failed, its hint completed, and returns its exit code."""
-    if isinstance(error, (click.Abort, KeyboardInterrupt)):
-        click.echo(signals.describe_end(_signalled(error)), err=True)
-    elif isinstance(error, click.exceptions.NoArgsIsHelpError):
-        error.show()
-    elif isinstance(error, click.ClickException):
-        console.print_error(error.format_message(), console.usage_hint(error))
-    elif isinstance(error, BrokenPipeError):
+        click.echo(text)
+    except BrokenPipeError:
         console.silence()
+        return ExitCode.BROKEN_PIPE
+    return code
+
+
+def _tell(
+    error: BaseException, log: Log, verb: str, complete_commands: Callable[[str], str]
+) -> Failure | None:
+    """Prints why a command failed, its hint completed, and returns it; None where nobody reads."""
+    code = _exit_code(error)
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        error.show()
+        return None
+    if isinstance(error, BrokenPipeError):
+        console.silence()
+        return None
+    if isinstance(error, (click.Abort, KeyboardInterrupt)):
+        failure = Failure(signals.describe_end(_signalled(error)), "", code)
+        log.fail(failure, prefix="")
+        return failure
+    if isinstance(error, click.ClickException):
+        message, hint = error.format_message(), console.usage_hint(error)
     else:
         logger.debug("failed", exc_info=error)
         known = _known(error)
-        if known is None:
-            console.print_error(
-                f"{type(error).__name__}: {error}",
-                "This is a bug in recon. Run the command again with -v and report its output.")
-        else:
-            console.print_error(known.message, complete(known.hint))
-    return _exit_code(error)
+        message, hint = (known.message, complete_commands(known.hint)) if known else (
+            f"{type(error).__name__}: {error}",
+            "This is a bug in recon. Run the command again with -v and report its output.")
+    if code == ExitCode.USAGE:
+        hint = f"{hint} {_name_variables(error, verb)}".strip()
+    failure = Failure(message, hint, code)
+    log.fail(failure)
+    return failure
+
+
+def _name_variables(error: BaseException, verb: str) -> str:
+    """Returns a sentence with the environment variables that a wrong value may be of."""
+    option = error.param if isinstance(error, click.BadParameter) else None
+    names = used_variables(cli.commands[verb]) if verb else []
+    if option is not None:
+        names = [name for name in names if name == option.envvar]
+    return f"Set in the environment: {', '.join(names)}." if names else ""
 
 
 def _exit_code(error: BaseException) -> int:

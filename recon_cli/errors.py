@@ -10,7 +10,7 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit codes of every command; docs/errors.md."""
+    """Exit codes of every command; docs/scripts.md."""
 
     DONE = 0
     BUG = 1

@@ -16,6 +16,8 @@ from typing import IO
 
 SAFE_PATH = "PYTHONSAFEPATH"
 CHILD = "RECON_JOB"  # environment variable of a command that ends with the one that started it
+# Variables that a child keeps; those of options are the parent's, which types what a child needs.
+_KEPT = ("RECON_CACHE_DIR", "RECON_GPU", "RECON_RUN_BY_RAY", "RECON_WORKSPACE")
 # Of Windows, where a session is a group of processes; elsewhere the flag is no flag.
 _OWN_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 _END: int = getattr(signal, "CTRL_BREAK_EVENT", signal.SIGTERM)
@@ -27,6 +29,13 @@ def protect_children() -> None:
     Libraries start some too, such as the resource tracker of `multiprocessing`.
     """
     os.environ[SAFE_PATH] = "1"
+
+
+def forget_options() -> None:
+    """Removes the environment variables that stand for options, RECON_TRAIN_ITERATIONS and so."""
+    for name in [name for name in os.environ if name.startswith("RECON_")]:
+        if name not in _KEPT:
+            del os.environ[name]
 
 
 def python_command(*arguments: str) -> list[str]:

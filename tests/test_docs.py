@@ -40,7 +40,7 @@ def _family(kind: type[ReconError]) -> set[int]:
 
 
 def test_every_exit_code_is_documented():
-    page = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "scripts.md").read_text(encoding="utf-8")
     for code in _family(ReconError) | set(ExitCode) - {ExitCode.SIGNAL, ExitCode.KILLED}:
         assert f"\n| {code} |" in page
 

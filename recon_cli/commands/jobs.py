@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -78,14 +79,22 @@ def report_outcome(outcome: Outcome) -> None:
     run = outcome.manifest.run
     if outcome.ran:
         sentence = describe_summary(outcome.stage, run.summary)
-        click.echo(f"{': '.join(filter(None, [outcome.stage, sentence]))} "
-                   f"({format_duration(run.seconds)})")
+        logger.info(
+            "%s (%s)", ": ".join(filter(None, [outcome.stage, sentence])),
+            format_duration(run.seconds), extra=_of(outcome))
         return
     files = (fresh_files(ExportSummary.from_json(run.summary))
              if outcome.stage == "export" and run.summary.get("files") else [])
-    click.echo(": ".join(filter(None, [f"{outcome.stage} is up to date", ", ".join(files)])))
+    logger.info("%s", ": ".join(
+        filter(None, [f"{outcome.stage} is up to date", ", ".join(files)])), extra=_of(outcome))
     for notice in run.summary.get("notices") or ():
         logger.warning("%s", notice)
+
+
+def _of(outcome: Outcome) -> dict[str, Any]:
+    """Returns the fields by which the log knows the end of a stage."""
+    return {"outcome": outcome, "event": "done", "stage": outcome.stage,
+            "seconds": outcome.manifest.run.seconds}
 
 
 def open_executor(

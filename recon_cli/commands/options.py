@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from recon_cli.commands.console import LOG_FORMATS, CapturedOutput, Style
 from recon_cli.config.fields import OptionInfo, StageConfig, field_type, member_types, option_info
 from recon_cli.config.settings import (
     FILE,
@@ -41,12 +43,11 @@ _METAVARS = {int: "N", float: "X", str: "TEXT"}
 
 
 @dataclass
-class Call:
+class Call(Style):
     """The typed command line, collected option by option."""
 
     workspace: Path = Path("workspace")  # of -w, RECON_WORKSPACE or the default
     config_file: Path | None = None
-    verbose: bool = False
     again: bool = False
     from_import: bool = False
     print_config: bool = False
@@ -159,18 +160,68 @@ def _store(name: str) -> Callable[[click.Context, click.Parameter, Any], None]:
     return store
 
 
-def _switch(flag: str, help: str, *short: str) -> Decorator:
+def _switch(flag: str, help: str, *short: str, expert: bool = False) -> Decorator:
     """Returns a decorator that adds a flag, stored under its own name in `Call`."""
     name = flag[2:].replace("-", "_")
     return click.option(
-        *short, flag, name, is_flag=True, expose_value=False, callback=_store(name),
-        help=f"{help}  [default: off]")
+        *short, flag, name, cls=Option, expert=expert, is_flag=True, expose_value=False,
+        callback=_store(name), help=f"{help}  [default: off]")
 
 
 verbosity = _switch("--verbose", "Show details and tracebacks.", "-v")
 again = _switch("--again", "Run anew, even if up to date.")
 from_import = _switch("--from-import", "Train the imported scene further.")
-print_config = _switch("--print-config", "Print options as TOML and exit.")
+print_config = _switch("--print-config", "Print options as TOML and exit.", expert=True)
+
+
+def _begin_object(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        ctx.ensure_object(Call).as_object = True
+        sys.stdout = CapturedOutput()  # `cli.main` puts the other one back
+
+
+def _style_options(*, has_json: bool, expert: bool) -> list[Option]:
+    """Returns the options by which every verb is told how to talk; eager, so that errors obey."""
+    quiet = Option(
+        ["-q", "--quiet"], is_flag=True, is_eager=True, expose_value=False,
+        callback=_store("quiet"),
+        help="No progress, no notices.  [default: off]")
+    log_format = Option(
+        ["--log-format"], type=click.Choice(LOG_FORMATS), default=LOG_FORMATS[0], is_eager=True,
+        expose_value=False, callback=_store("log_format"), expert=expert,
+        help="Log on stderr; auto: bars on a terminal, else lines with the time.  [default: auto]")
+    as_object = Option(
+        ["--json", "as_object"], is_flag=True, is_eager=True, expose_value=False,
+        callback=_begin_object,
+        help="Print one JSON object at the end.  [default: off]")
+    return [quiet, log_format, *([] if has_json else [as_object])]
+
+
+def complete(command: click.Command, *words: str) -> click.Command:
+    """Gives a command the options that every verb has, and each option its variable.
+
+    That is RECON_TRAIN_ITERATIONS for --iterations of `recon train`. `words` call the command.
+    """
+    typed = {name for option in command.params for name in option.opts}
+    if "--quiet" in typed:
+        return command
+    command.params += _style_options(
+        has_json="--json" in typed, expert=isinstance(command, Verb))
+    for option in command.params:
+        if isinstance(option, click.Option) and not option.envvar:
+            flag = next(name for name in option.opts if name.startswith("--"))
+            option.envvar = "_".join(["RECON", *words, flag[2:]]).upper().replace("-", "_")
+    if isinstance(command, click.Group):
+        for name, under in command.commands.items():
+            complete(under, *words, name)
+    return command
+
+
+def used_variables(command: click.Command) -> list[str]:
+    """Returns the environment variables that set an option of a command, besides -w."""
+    return [option.envvar for option in command.params
+            if isinstance(option.envvar, str) and option.name != "workspace"
+            and os.environ.get(option.envvar)]
 
 
 def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPACE") -> Decorator:

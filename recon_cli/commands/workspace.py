@@ -15,10 +15,11 @@ from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.sentences import describe_summary
 from recon_cli.pipeline import plan
-from recon_cli.pipeline.plan import Job, StageStatus, free_space
+from recon_cli.pipeline.clean import Removal, find_states, free_space
+from recon_cli.pipeline.plan import Job, StageStatus
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.stages import STAGES
-from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.layout import Workspace, size_of
 from recon_cli.workspace.manifest import describe_progress
 
 logger = logging.getLogger("recon")
@@ -82,22 +83,50 @@ def status_table(stages: Sequence[StageStatus]) -> str:
 @verb("clean")
 @click.argument(
     "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice([row.name for row in STAGES]))
+@click.option(
+    "--states", is_flag=True,
+    help="Also remove the states midway and at the end of a training; without them a longer one "
+         "begins anew, and prune needs `recon train --again`.  [default: off]")
+@click.option(
+    "--keep-exports", is_flag=True,
+    help="Remove all results but the exported files.  [default: off]")
 @click.option("--dry-run", is_flag=True, help="Only list the files and sizes.  [default: off]")
 @options.common()
 @pass_call
-def clean(call: Call, stages: tuple[str, ...], dry_run: bool) -> None:
+def clean(
+    call: Call, stages: tuple[str, ...], states: bool, keep_exports: bool, dry_run: bool
+) -> None:
     """Free disk space.
 
     Without STAGE, removes unfinished work and scratch files and keeps every finished result. With
-    STAGE, removes the results of those stages.
+    STAGE, removes the results of those stages. Files are listed with their sizes first; exports
+    are removed only by `recon clean export`.
     """
+    if stages and (states or keep_exports):
+        raise click.UsageError("STAGE excludes --states and --keep-exports.")
     job = Job(Workspace(call.workspace), table=STAGES)  # recon.toml may be damaged
-    freed = free_space(job, stages, dry=dry_run)
-    for item in freed:
-        link = " (a link; its target stays)" * item.is_link
-        click.echo(f"{item.path}: {format_megabytes(item.size)}{link}")
+    freed = free_space(
+        job, stages, states=states, keep_exports=keep_exports, dry=dry_run,
+        show=lambda removals: _list_removals(job, removals))
     outcome = "would be freed" if dry_run else "freed"
     click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
+    more = [] if stages or states or keep_exports else find_states(job)
+    if more:
+        logger.info(
+            "`recon clean --states` frees %s more: %s",
+            format_megabytes(sum(map(size_of, more))),
+            ", ".join(str(path.relative_to(job.workspace.root)) for path in more))
+
+
+def _list_removals(job: Job, removals: Sequence[Removal]) -> None:
+    """Prints what is removed, by stage, with sizes."""
+    for stage in dict.fromkeys(item.stage for item in removals):
+        own = [item for item in removals if item.stage == stage]
+        click.echo(f"{stage or 'scratch'}: {format_megabytes(sum(item.size for item in own))}")
+        for item in own:
+            link = " (a link; its target stays)" * item.is_link
+            click.echo(f"  {item.path.relative_to(job.workspace.root)}: "
+                       f"{format_megabytes(item.size)}{link}")
 
 
 @verb("report")

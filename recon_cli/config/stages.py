@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -450,12 +451,18 @@ class ComputeConfig(StageConfig):
     """Where the numerical work runs. Recorded in the manifest, never part of a fingerprint."""
 
     device: str = option(
-        "auto", "Device; auto: CUDA if available.", choices=("auto", "cpu", "cuda"), hashed=False)
+        "auto", "Device; auto: CUDA if available.", metavar="auto|cpu|cuda[:N]",
+        hashed=False)
     backend: str = option(
         "auto", "Rasterizer; auto: the fastest.",
-        choices=("auto", "triton", "numba", "torch"), hashed=False)
+        choices=("auto", "triton", "numba", "torch"), hashed=False, expert=True)
     threads: int | None = option(
         None, "CPU threads.", minimum=1, hashed=False, automatic="all cores")
     max_memory: float | None = option(
         None, "Memory that training may take; images that do not fit are read from the disk.",
         unit="GB", minimum=0.1, hashed=False, automatic="all that is free", expert=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not re.fullmatch(r"auto|cpu|cuda(:[0-9]{1,3})?", self.device):
+            raise self._error("device", self.device, "auto, cpu, cuda, or cuda:N for one GPU")

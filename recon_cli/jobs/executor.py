@@ -23,12 +23,21 @@ from recon_cli.processes import CHILD, ask_to_end, start_module
 from recon_cli.workspace.layout import LOCK
 
 PROGRAM = "recon_cli"  # the module that is run
-NEEDS_GPU = {"auto": None, "cpu": False, "cuda": True}  # by --device; None: if a machine has one
 CORES = 4  # of a command where nothing is said; more shorten it by little
 TRIES = 3  # of a command whose process is killed, by the system for want of memory or by somebody
 _ENDED = (ExitCode.HANGUP, ExitCode.TERMINATED)  # by a signal that recon handles
 _LOCK_SECONDS = 60.0  # within which a process that lost its parent is gone
 _STOP_SECONDS = 60.0  # for saving a checkpoint
+
+
+class _NeedsGpu(dict[str, bool | None]):
+    """Whether a command needs a GPU, by --device; None: if a machine has one."""
+
+    def __missing__(self, _device: str) -> bool:
+        return True  # cuda:N
+
+
+NEEDS_GPU = _NeedsGpu({"auto": None, "cpu": False, "cuda": True})
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def _needs_kernels(backend: str, device: str) -> bool:
     hint misleads, kernels are compiled when they are needed.
     """
     gpu = device != "cpu" and backend in ("auto", "triton") and _DRIVER.exists()
-    cpu = device != "cuda" and backend in ("auto", "numba")
+    cpu = not device.startswith("cuda") and backend in ("auto", "numba")
     if not gpu and not cpu:
         return False
     checked = gpu and _made_since_installed("self-check/triton-*.json", "triton")

@@ -21,7 +21,7 @@ from recon_cli.context import EarlierResult, StageContext, StageInputs, TrainCal
 from recon_cli.errors import ConfigError, ManifestError, ReconError
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
-from recon_cli.progress import NullProgress, Progress
+from recon_cli.progress import NullProgress, Progress, in_stage
 from recon_cli.stages import STAGES, Stage
 from recon_cli.workspace.digests import Source, digest_file, digest_outputs, read_source
 from recon_cli.workspace.layout import Workspace
@@ -93,7 +93,8 @@ def run_stage(
         workspace.discard(row.name)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
-    with machine.Meter() as meter, _discard_if_not_begun(workspace, row.name):
+    with machine.Meter() as meter, in_stage(row.name), _discard_if_not_begun(
+            workspace, row.name):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
         run_it = import_module(row.module).run
         with importing_ahead(job) as while_idle:

@@ -172,7 +172,8 @@ class WorkspaceCheck:
         reasons += differences(
             manifest.key, expected, section=layers.section_of(row.config),
             without=row.config.per_file_fields())
-        reasons += find_changed_outputs(self._workspace.folder(row.name), manifest, row.volatile)
+        reasons += find_changed_outputs(
+            self._workspace.folder(row.name), manifest, row.volatile, row.states)
         try:  # another version may have written another record
             summary = row.summary.from_json(manifest.run.summary)
             reasons += summary.contradictions(dataclasses.asdict(config))

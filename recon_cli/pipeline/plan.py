@@ -21,21 +21,18 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
-from recon_cli.errors import ManifestError, StageError
+from recon_cli.errors import StageError
 from recon_cli.pipeline.compile_ahead import compile_ahead
 from recon_cli.pipeline.continuation import Start, is_imported, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
 from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, matches, read_source
-from recon_cli.workspace.layout import LOG, disk_errors, has_link, remove, size_of
+from recon_cli.workspace.layout import LOG, disk_errors
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.paths import is_plain_file
 
 __all__ = ["Job", "Outcome", "StageStatus", "Target", "plan", "run", "run_stage", "status"]
-
-# Logs are volatile too, but later stages read times from them and they free next to nothing.
-_WORTH_BYTES = 1 << 20
 
 logger = logging.getLogger("recon")
 
@@ -226,11 +223,23 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         plan(checks, row.name)  # a fresh stage may have become stale by the last one
         fresh = None if again else _find_fresh(job, checks, target, sources)
     if fresh is None:
+        _require_states(job, checks, row)
         start = Start.ANEW if again and target.start is Start.AUTO else target.start
         manifest = run_stage(job, checks, row, target.config, sources, start=start, again=again)
         yield Outcome(row.name, manifest, ran=True)
     else:
         yield Outcome(row.name, fresh, ran=False)
+
+
+def _require_states(job: Job, checks: WorkspaceCheck, row: Stage) -> None:
+    """Raises StageError where a stage starts from a state that `recon clean` removed."""
+    for check in map(checks.check, row.from_states):
+        for name in check.manifest.outputs if check.manifest else ():
+            if matches(name, check.row.states) and not (
+                    job.workspace.folder(check.row.name) / name).exists():
+                raise StageError(
+                    f"{row.verb} starts from {check.row.name}/{name}, which was removed.",
+                    hint=f"Run `{command(checks, check)} --again` first.")
 
 
 def _run_if_needed(job: Job, row: Stage) -> Iterator[Outcome]:
@@ -305,53 +314,3 @@ def _log_to(path: Path) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         handler.close()
-
-
-@dataclass(frozen=True)
-class Freed:
-    """Something that is removed, and its size in bytes."""
-
-    path: Path
-    size: int
-    is_link: bool  # which alone is removed, not its target
-
-
-def free_space(job: Job, stages: Sequence[str] = (), *, dry: bool = False) -> tuple[Freed, ...]:
-    """Removes dispensable files and returns them; with `dry` nothing is removed.
-
-    That is unfinished work, replaced results and large volatile files, or the results of `stages`.
-    Nothing is removed through a link.
-
-    Raises:
-        WorkspaceError: another process holds the workspace, or it cannot be written.
-    """
-    workspace = job.workspace
-    if not workspace.root.exists():
-        return ()
-    with disk_errors(workspace.root, "cleaning"), workspace.writing("clean"):
-        paths = [workspace.folder(stage) for stage in stages] or _spare(job)
-        freed = tuple(Freed(path, size_of(path), path.is_symlink()) for path in paths
-                      if os.path.lexists(path))
-        if dry:
-            return freed
-        for stage in stages:
-            workspace.remove(stage)
-        for path in () if stages else paths:
-            remove(path)
-    return freed
-
-
-def _spare(job: Job) -> list[Path]:
-    paths = job.workspace.scraps()
-    for row in job.table:
-        folder = job.workspace.folder(row.name)
-        try:
-            manifest = job.workspace.manifest(row.name)
-        except ManifestError as error:
-            logger.warning("%s is left as it is: %s %s", row.name, error.message, error.hint)
-            continue
-        paths += [
-            folder / name for name, file in (manifest.outputs if manifest else {}).items()
-            if matches(name, row.volatile) and file.size >= _WORTH_BYTES
-            and not has_link(folder / name, job.workspace.root)]
-    return paths

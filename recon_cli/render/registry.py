@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -24,6 +25,7 @@ from recon_cli.scene.splats import Splats
 if TYPE_CHECKING:
     from recon_cli.render.self_check import Verdict
 
+_SEEN = "RECON_GPU"  # environment variable of processes that see one GPU alone: its cuda:N
 _OLDEST_GPU = (7, 5)  # compute capability, of Turing: what triton's kernels are compiled for
 
 logger = logging.getLogger("recon")
@@ -71,10 +73,15 @@ def cuda_verdict() -> Verdict | None:
 def resolve(backend: str, device: str) -> tuple[str, str]:
     """Returns (backend, device) with every `auto` replaced by the actual choice.
 
+    The device is then cpu or cuda: of `cuda:N` this process, and each that it starts, sees that
+    GPU alone, which must be asked for before anything else uses CUDA.
+
     On CUDA `auto` takes triton only where its kernels passed the self-check on this GPU. A backend
     that was named runs even where it failed, with a warning: it may be the check that is wrong.
     BackendError if the named one cannot run; nothing else is used instead.
     """
+    if device.startswith("cuda:"):
+        device = _see_one_gpu(device)
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendError(
             "CUDA was asked for, but torch finds no CUDA device.",
@@ -98,6 +105,26 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
             "the triton kernels failed their self-check on %s (%s): results may be wrong. "
             "`--backend torch` is slower and safe.", verdict.device, verdict.failure)
     return backend, device
+
+
+def _see_one_gpu(device: str) -> str:
+    """Hides all GPUs but one from CUDA and returns "cuda"; BackendError if that one is not there.
+
+    Not by torch's current device, which other threads and the kernels in them do not have.
+    """
+    if os.environ.get(_SEEN) == device:  # perhaps by the process that started this one
+        return "cuda"
+    index, count = int(device.partition(":")[2]), torch.cuda.device_count()
+    if index >= count:
+        there = ", ".join(f"cuda:{number}" for number in range(count))
+        raise BackendError(
+            f"{device} was asked for, but torch finds {there or 'no CUDA device'}.",
+            hint="Give --device one of those." if count else
+            "Leave --device out, or run `recon doctor`.")
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    names = visible.split(",") if visible else [str(number) for number in range(count)]
+    os.environ |= {"CUDA_VISIBLE_DEVICES": names[index].strip(), _SEEN: device}
+    return "cuda"
 
 
 def _fastest(backends: Iterable[BackendStatus], device: str) -> str:

@@ -46,6 +46,9 @@ class Stage:
     module: str  # of its run()
     # patterns of outputs (times, logs, for resuming) that later stages' fingerprints leave out
     volatile: tuple[str, ...] = ()
+    # patterns of outputs that only continue it: without them it is fresh, and begins anew
+    states: tuple[str, ...] = ()
+    from_states: tuple[str, ...] = ()  # the `needs` whose states it starts from
     renders: bool = False  # it needs a rasterizer, and so torch and a device
     own_digests: bool = False  # it finds damage in its unfinished work by itself
     input_metavar: str = ""  # the user's input in usage; empty for stages that only read others
@@ -66,9 +69,10 @@ STAGES: tuple[Stage, ...] = (
           ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json"),
           own_digests=True, late=("part", "gravity", "scale_between")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 5, False,
-          "recon_cli.stages.train", ("log.jsonl", "plan.json"), renders=True),
+          "recon_cli.stages.train", ("log.jsonl", "plan.json"),
+          states=("mid.safetensors", "final.safetensors"), renders=True),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
-          "recon_cli.stages.prune", ("log.jsonl",), renders=True),
+          "recon_cli.stages.prune", ("log.jsonl",), from_states=("train",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig,
           EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,

@@ -199,12 +199,18 @@ def differences(
     return reasons
 
 
-def find_changed_outputs(folder: Path, finished: Manifest, volatile: Sequence[str]) -> list[str]:
-    """Returns in words which outputs are no longer what the stage wrote."""
+def find_changed_outputs(
+    folder: Path, finished: Manifest, volatile: Sequence[str], removable: Sequence[str] = ()
+) -> list[str]:
+    """Returns in words which outputs are no longer what the stage wrote.
+
+    Names that match `volatile` may differ, those that match `removable` may be missing.
+    """
     changes = []
     for name, known in finished.outputs.items():
         path = folder / name
-        if matches(name, volatile):
+        if matches(name, volatile) or (
+                matches(name, removable) and not os.path.lexists(path)):
             continue
         if not os.path.isfile(path):  # False, too, for a name that no system takes
             changes.append(f"output {name} is missing")

@@ -269,7 +269,7 @@ def test_verbose_shows_the_traceback(capsys: Said) -> None:
 def test_clean_keeps_every_finished_result_fresh(
     capsys: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recon_cli.pipeline.plan._WORTH_BYTES", 1)
+    monkeypatch.setattr("recon_cli.pipeline.clean._WORTH_BYTES", 1)
     main(["run", "room.mp4"])
     fake_stages.actions["train"] = lambda: _raise(KeyboardInterrupt())
     main(["train", "--iterations", "9"])

@@ -113,7 +113,7 @@ def copy(source: Path, target: Path, *, without: Sequence[str] = ()) -> Path:
 
 def notices(text: str) -> set[str]:
     """Returns the notices of a command's stderr, without their numbers."""
-    lines = [line for line in text.splitlines() if line.startswith("notice:")]
+    lines = [line for line in text.splitlines() if "notice: " in line]
     return {re.sub(r"[\d.,]+", "#", line) for line in lines}
 
 

@@ -10,8 +10,9 @@ import pytest
 from fake_stages import NAMES, bring, job_at
 
 from recon_cli.errors import ManifestError
-from recon_cli.pipeline import plan
-from recon_cli.pipeline.plan import Job, free_space
+from recon_cli.pipeline import clean, plan
+from recon_cli.pipeline.clean import free_space
+from recon_cli.pipeline.plan import Job
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.digests import sha256_json
 
@@ -105,7 +106,7 @@ def test_one_damaged_manifest_stops_neither_status_nor_clean_for_the_others(
 def test_clean_removes_a_large_file_but_not_one_behind_a_link(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan, "_WORTH_BYTES", 1)
+    monkeypatch.setattr(clean, "_WORTH_BYTES", 1)
     sfm = job.workspace.folder("sfm")
     assert sfm / "database.db" in [item.path for item in free_space(job, dry=True)]
     sfm.rename(tmp_path / "large")
