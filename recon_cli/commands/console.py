@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import sys
@@ -10,6 +11,7 @@ from typing import TextIO
 
 import click
 
+from recon_cli.config.settings import SECTIONS
 from recon_cli.progress import hide_bars
 
 logger = logging.getLogger("recon")
@@ -59,10 +61,38 @@ def print_error(message: str, hint: str) -> None:
         click.echo(f"hint: {hint}", err=True)
 
 
+class HintedUsageError(click.UsageError):
+    """A wrong command line, with what to type instead."""
+
+    def __init__(self, message: str, *, hint: str) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
 def usage_hint(error: click.ClickException) -> str:
-    """Returns which --help explains the verb that was typed; empty where none was."""
+    """Returns what to type instead, or which --help explains the verb; empty where none was."""
+    if isinstance(error, HintedUsageError):
+        return error.hint
+    if isinstance(error, click.NoSuchOption):
+        found = _setting(error)
+        if found:
+            return found
     ctx = error.ctx if isinstance(error, click.UsageError) else None
     return f"See `{ctx.command_path} --help`." if ctx else ""
+
+
+def _setting(error: click.NoSuchOption) -> str:
+    """Returns how an option of a stage is set in a verb that runs many; empty where it has none."""
+    if error.ctx is None or not any(
+            parameter.name == "assigned" for parameter in error.ctx.command.params):
+        return ""
+    name = error.option_name.lstrip("-").replace("-", "_")
+    sections = [section for section, config in SECTIONS.items()
+                if name in {item.name for item in dataclasses.fields(config)}]
+    if not sections:
+        return ""
+    ways = " or ".join(f"--set {section}.{name}=VALUE" for section in sections)
+    return f"{error.ctx.command_path} sets it by {ways}."
 
 
 def silence() -> None:

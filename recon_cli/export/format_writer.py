@@ -85,7 +85,8 @@ class FormatWriter:
                 centers = [camera.center for _, camera in self._source.place(
                     self._source.scene.train)]
                 write_plan(self._out, self._mesh, np.stack(centers), self._room_frame)
-        return ExportedFile(file=row.file)
+        path = self._out / row.file
+        return ExportedFile(file=row.file, bytes=path.stat().st_size if path.is_file() else None)
 
     def _write_gaussians(self, row: ExportFormat) -> ExportedFile:
         path = self._out / row.file

@@ -1,0 +1,46 @@
+"""The end of a run: what was made, where it lies, how good it is, and what to type next."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import webbrowser
+from pathlib import Path
+
+import click
+
+from recon_cli.commands.jobs import open_job
+from recon_cli.commands.options import Call
+from recon_cli.progress import format_megabytes
+from recon_cli.workspace.export_record import ExportSummary
+
+
+def end_run(call: Call, *, open_page: bool = False) -> None:
+    """Writes the report, and prints the results of a run that is complete."""
+    from recon_cli.report.build import FILE, write_report
+
+    job = open_job(call)
+    folder = job.workspace.folder("export")
+    manifest = job.workspace.manifest("export")
+    assert manifest is not None, "the run has exported"
+    export = ExportSummary.from_json(manifest.run.summary)
+    write_report(job, None)
+    report = job.workspace.root / FILE
+    html = (export.files or {}).get("html")
+    page = folder / html.file if html is not None and not html.stale else None
+    click.echo("")
+    for name, path in (("scene", folder / export.file), ("page", page), ("report", report)):
+        if path is not None:
+            click.echo(f"{name + ':':8}{path} ({format_megabytes(path.stat().st_size)})")
+    click.echo(f"next:   {_next_command(call.workspace, page)}")
+    if open_page:
+        webbrowser.open((page or report).resolve().as_uri())
+
+
+def _next_command(workspace: Path, page: Path | None) -> str:
+    """Returns what to do with the results."""
+    usual = Path(os.environ.get("RECON_WORKSPACE") or "workspace")
+    named = "" if workspace == usual else f" -w {shlex.quote(str(workspace))}"
+    if page is None:
+        return f"recon view{named}"
+    return f"open {page.name} in a browser or send it; recon render --tour --out walk.mp4{named}"
