@@ -39,8 +39,13 @@ def end_run(call: Call, *, open_page: bool = False) -> None:
 
 def _next_command(workspace: Path, page: Path | None) -> str:
     """Returns what to do with the results."""
-    usual = Path(os.environ.get("RECON_WORKSPACE") or "workspace")
-    named = "" if workspace == usual else f" -w {shlex.quote(str(workspace))}"
     if page is None:
-        return f"recon view{named}"
-    return f"open {page.name} in a browser or send it; recon render --tour --out walk.mp4{named}"
+        return name_workspace("recon view", workspace)
+    return (f"open {page.name} in a browser or send it; "
+            f"{name_workspace('recon render --tour --out walk.mp4', workspace)}")
+
+
+def name_workspace(command: str, workspace: Path) -> str:
+    """Returns a command with the workspace, unless it is the one that is taken without -w."""
+    usual = Path(os.environ.get("RECON_WORKSPACE") or "workspace")
+    return command if workspace == usual else f"{command} -w {shlex.quote(str(workspace))}"

@@ -10,7 +10,7 @@ import click
 
 from recon_cli.commands import options
 from recon_cli.commands.budget import run_within
-from recon_cli.commands.ending import end_run
+from recon_cli.commands.ending import end_run, name_workspace
 from recon_cli.commands.jobs import open_job_with, run_stages
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.view import show_training
@@ -116,6 +116,9 @@ def import_scene(call: Call, file: Path | None) -> None:
     table = tuple(IMPORT if row.name == IMPORT.name else row for row in STAGES)
     run_stages(
         call, IMPORT.verb, [IMPORT.name], sources=() if file is None else (file,), table=table)
+    if not call.print_config:
+        click.echo(f"next:   {name_workspace('recon view', call.workspace)} or "
+                   f"{name_workspace('recon export --format html', call.workspace)}")
 
 
 def _parse_ratios(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[float, ...]:
