@@ -10,7 +10,7 @@ import click
 
 from recon_cli.commands import options
 from recon_cli.commands.budget import run_within
-from recon_cli.commands.ending import end_run, name_workspace
+from recon_cli.commands.ending import end_run, name_workspace, optional_page
 from recon_cli.commands.jobs import open_job_with, run_stages
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.view import show_training
@@ -224,11 +224,12 @@ def run(
     INPUT is as for `recon ingest`. Without it, the previous input is used. The results are the
     scene (.ply), a page to look around in it (.html), and a report.
     """
-    if minutes is not None and not call.print_config:
-        run_within(call, minutes, inputs, RUN, with_prune=with_prune)
-    else:
-        stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
-        run_stages(call, "run", stages, sources=inputs, base=RUN)
+    stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
+    with optional_page(call):
+        if minutes is not None and not call.print_config:
+            run_within(call, minutes, inputs, RUN, with_prune=with_prune)
+        else:
+            run_stages(call, "run", stages, sources=inputs, base=RUN)
     if not call.print_config:
         end_run(call, open_page=with_open)
 
@@ -241,5 +242,6 @@ def run(
 @pass_call
 def demo(call: Call) -> None:
     """Run every stage on the bundled room video."""
-    run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=DEMO)
+    with optional_page(call):
+        run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=DEMO)
     end_run(call)
