@@ -14,6 +14,7 @@ is also that of the readers in Spark and splat-transform.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -119,13 +120,15 @@ def _decode_means(
     centre = np.ndarray((buckets, 3), "<f4", data, start + 4 * partial, (stride, 4))
     half = int(section["steps"]) or _STEPS
     side = float(section["bucket_side"]) / 2
-    return (steps.astype(np.float64) - half) * (side / half) + centre[bucket]
+    means: NDArray[np.float64] = (
+        (steps.astype(np.float64) - half) * (side / half) + centre[bucket])
+    return means
 
 
 def _by_term(rest: NDArray[Any], degree: int) -> NDArray[np.float32]:
     """Returns coefficients [N, T, 3] of rows that hold a channel after the other in each degree."""
     parts = [np.zeros((len(rest), 0, 3), np.float32)]
-    for low, high in zip(TERMS[:degree], TERMS[1: degree + 1], strict=True):
+    for low, high in pairwise(TERMS[: degree + 1]):
         part = rest[:, 3 * low: 3 * high].astype(np.float32)
         parts.append(part.reshape(len(rest), 3, high - low).transpose(0, 2, 1))
     return np.concatenate(parts, axis=1)

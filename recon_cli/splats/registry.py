@@ -19,7 +19,7 @@ logger = logging.getLogger("recon")
 
 FORMATS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
-_READABLE = {**FORMATS, **{
+_READABLE: dict[str, SplatFormat] = {**FORMATS, **{
     row.name: import_module(row.module).FORMAT for row in READ_ONLY.values()}}
 
 
