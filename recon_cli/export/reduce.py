@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,7 +14,6 @@ from torch import Tensor
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
 from recon_cli.export.cleanup import drop_floaters, drop_islands
-from recon_cli.export.source import ExportSource
 from recon_cli.io.images import fit_camera
 from recon_cli.io.views import evenly_spread
 from recon_cli.render import render
@@ -21,8 +21,10 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.importance import Importance, add_views
-from recon_cli.train.prune_loop import survivors
 from recon_cli.workspace.export_record import ExportChange
+
+if TYPE_CHECKING:  # the readers of views, which `recon convert` starts without
+    from recon_cli.export.source import ExportSource
 
 Box = tuple[float, float, float, float, float, float]  # x, y, z of the lowest corner, the highest
 
@@ -76,6 +78,8 @@ class _HighestScores:
 
     def take(self, scene: Splats, count: int) -> Splats:
         """Returns as many of the scene, which may be in another degree."""
+        from recon_cli.train.prune_loop import survivors  # imports the whole training
+
         return scene.select(survivors(self._score, count))
 
     @cached_property
