@@ -26,14 +26,14 @@ from recon_cli.scene.gravity import turn_onto
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, joined, transformed
-from recon_cli.splats.axes import UP
+from recon_cli.splats.axes import UP, nearest_up
 from recon_cli.splats.coarsen import coarsen
 from recon_cli.splats.format import LoadedScene, WriteSettings
+from recon_cli.splats.lod import discard_levels
 from recon_cli.splats.registry import FORMATS, format_of, load_splats
 from recon_cli.workspace import durable
 from recon_cli.workspace.atomic import sync_folder
 from recon_cli.workspace.export_formats import ExportFormat
-from recon_cli.workspace.layout import remove
 
 _VIEW_SIZE = 600  # pixels, longest side of the renders that a file is checked on
 _GUESSED_UP = "-y"  # of a file that does not say, as in viewers
@@ -92,24 +92,23 @@ def convert(request: ConvertRequest, ctx: StageContext) -> Converted:
         ReconstructionError: the file would lose more than it may.
     """
     row = _check_out(request)
-    scene = _merge(request, ctx)
-    up = UP[scene.up or _GUESSED_UP]
-    settings = WriteSettings(
-        up=np.array(up), antialiased=scene.antialiased, title=request.out.name)
-    reducer = _Reducer(scene.splats, np.array(up), ctx)
+    whole, settings = _merge(request, ctx)
+    assert settings.up is not None, "of a merged scene it is known, or taken to be -y"
+    reducer = _Reducer(whole, settings.up, ctx)
     splats = reducer.reduce(
         request, lambda changed: measure_size(row, changed, settings))
-    checked = reducer if splats is scene.splats else _Reducer(splats, np.array(up), ctx)
+    checked = reducer if splats is whole else _Reducer(splats, settings.up, ctx)
     folder = request.out.parent
     with tempfile.TemporaryDirectory(dir=folder, prefix=".recon-convert-") as scratch:
         path = Path(scratch) / request.out.name
         gain = _write(row, path, splats, settings, request, checked)
         size = file_size(row, path)
-        for part in _parts(row, path):  # the index of a folder of files is the last
-            target = folder / part.name
-            if target.is_dir():
-                remove(target)
-            durable.replace(part, target)
+        if row.name == "lod":
+            discard_levels(request.out)
+            for part in path.parent.iterdir():
+                if part != path:  # it names the others, and is the last
+                    durable.rename(part, folder / part.name)
+        durable.replace(path, request.out)
     sync_folder(folder)
     return Converted(str(request.out), len(splats), splats.sh_degree, size, round(gain, 4))
 
@@ -135,13 +134,6 @@ def _check_out(request: ConvertRequest) -> ExportFormat:
     return row
 
 
-def _parts(row: ExportFormat, path: Path) -> list[Path]:
-    """Returns what was written, in the order in which it is put in place."""
-    if "/" not in row.file:
-        return [path]
-    return [*sorted(part for part in path.parent.iterdir() if part != path), path]
-
-
 def _write(
     row: ExportFormat, path: Path, splats: Splats, settings: WriteSettings,
     request: ConvertRequest, reducer: _Reducer,
@@ -165,10 +157,10 @@ def _write(
     return gain
 
 
-def _merge(request: ConvertRequest, ctx: StageContext) -> LoadedScene:
-    """Returns the scene of all inputs, each in its place, with the up and scale of the request.
+def _merge(request: ConvertRequest, ctx: StageContext) -> tuple[Splats, WriteSettings]:
+    """Returns the scene of all inputs, each in its place, and the facts that a file can hold.
 
-    `up` is None where no input says it. Each position is rounded to float32 once.
+    Up and scale are those of the request. Each position is rounded to float32 once.
     """
     scenes = [load_splats(path) for path in request.inputs]
     for path, scene in zip(request.inputs, scenes, strict=True):
@@ -196,10 +188,9 @@ def _merge(request: ConvertRequest, ctx: StageContext) -> LoadedScene:
         whole = world.after(similarity)
         part = scene.splats if whole.is_identity else transformed(scene.splats, whole)
         parts.append(part.with_degree(degree) if part.sh_degree < degree else part)
-    up = request.up or _nearest(world.rotation @ ups[0], scenes[0].up)
-    return LoadedScene(
-        parts[0] if len(parts) == 1 else joined(parts)[0], up,
-        all(scene.antialiased for scene in scenes))
+    return parts[0] if len(parts) == 1 else joined(parts)[0], WriteSettings(
+        up=world.rotation @ ups[0], antialiased=all(scene.antialiased for scene in scenes),
+        title=request.out.name)
 
 
 def _moved(by: tuple[float, float, float]) -> Similarity:
@@ -216,13 +207,6 @@ def _world(
         ctx.notice(f"{request.inputs[0].name} does not say where up is: --up takes {_GUESSED_UP}, "
                    "as viewers do")
     return Similarity(scale=request.scale, rotation=turn_onto(up, np.array(UP[request.up])))
-
-
-def _nearest(up: NDArray[np.float64], stated: str | None) -> str | None:
-    """Returns the axis that is up after a rotation; None if none is, or the file did not say."""
-    if stated is None:
-        return None
-    return next((name for name, axis in UP.items() if up @ axis > 1 - 1e-6), None)
 
 
 def _tell_differences(
@@ -252,7 +236,13 @@ class _Reducer:
 
     @cached_property
     def _scene(self) -> Scene:
-        return synthetic_scene(self._splats, up=self._up, max_size=_VIEW_SIZE)
+        up = np.array(UP[nearest_up(self._up)])
+        return synthetic_scene(self._splats, up=up, max_size=_VIEW_SIZE)
+
+    @property
+    def _room(self) -> tuple[list[float], float]:
+        """Middle [3] and radius, outside which lies only the view from windows."""
+        return self._scene.center.tolist(), self._scene.reach
 
     @cached_property
     def psnr(self) -> SelfPsnr:
@@ -276,12 +266,11 @@ class _Reducer:
             measure_change(option, splats, after, self.psnr.psnr_db)
             return after
 
-        room = self._scene.center.tolist(), self._scene.reach
         if request.drop_floaters:
             self._ctx.notice(_NO_VIEWS)
-            splats = step("drop_floaters", drop_floaters_without_views(splats, room))
+            splats = step("drop_floaters", drop_floaters_without_views(splats, self._room))
         if request.drop_islands:
-            splats = step("drop_islands", drop_islands(splats, room, None, self._ctx))
+            splats = step("drop_islands", drop_islands(splats, self._room, None, self._ctx))
         if request.crop is not None:
             splats = step("crop", crop(splats, request.crop))
         if request.sh_degree is not None and request.sh_degree < splats.sh_degree:

@@ -96,7 +96,8 @@ def describe_file(path: Path, ctx: StageContext) -> FileFindings:
     size = splats.scales.amax(dim=1)
     low, high = find_bulk(means)
     overdraw = _measure_overdraw(splats, np.array(UP[scene.up or "-y"]), ctx)
-    shift = torch.tensor(scene.origin.point if scene.origin else (0.0, 0.0, 0.0))
+    shift = torch.tensor(
+        scene.origin.point if scene.origin else (0.0, 0.0, 0.0), dtype=torch.float64)
     problems += _find_problems(scene, radius, (low, high), overdraw)
     return FileFindings(
         file=str(path), format=format_of(path).name, bytes=path.stat().st_size,

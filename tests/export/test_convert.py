@@ -93,6 +93,8 @@ def test_scale_and_up_turn_the_whole_scene(tmp_path: Path) -> None:
     run(tmp_path / "a.ply", tmp_path / "c.ply")
     assert load_splats(tmp_path / "c.ply").up == "z"
     assert load_splats(tmp_path / "b.ply").up is None
+    run(tmp_path / "a.ply", tmp_path / "d.spz", up="-y", max_loss=9.0)
+    assert load_splats(tmp_path / "d.spz").up == "-y"
 
 
 def test_only_scenes_that_are_all_antialiased_say_so(
@@ -194,6 +196,7 @@ def test_an_existing_file_is_replaced_by_force_alone(tmp_path: Path) -> None:
 def test_levels_replace_only_their_own_files(tmp_path: Path) -> None:
     source, out = ply(tmp_path / "a.ply", room(30)), tmp_path / "lod-meta.json"
     run(source, out, max_loss=9.0)
+    (tmp_path / "1_0").mkdir()  # of a larger scene
     run(source, out, max_loss=9.0, force=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0_0", "a.ply", "lod-meta.json"]
     assert len(read_splats(out)) == 30
