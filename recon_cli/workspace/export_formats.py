@@ -87,6 +87,7 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
 # Formats that are read, but not written.
 READ_ONLY: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("ksplat", "gaussians", "splats.ksplat", "recon_cli.splats.ksplat"),
+    ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad"),
 )}
 
 
