@@ -5,15 +5,20 @@ from __future__ import annotations
 import struct
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import torch
+from spark import assert_spark_agrees
 from splat_cases import damaged
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import SH_C0, TERMS
 from recon_cli.splats.registry import load_splats, read_splats
+
+if TYPE_CHECKING:
+    from browser import WatchedPage
 
 N, FULL = 7, 3  # two full buckets of three, and one more with the last Gaussian
 CENTRES = np.array([[1.0, 2, 3], [-4, 0, 5], [100, 0, 0]], np.float32)
@@ -28,9 +33,10 @@ def values(degree: int) -> dict[str, np.ndarray]:
     steps = rng.integers(0, 2 * STEPS, (N, 3))
     means = (steps - STEPS) * (SIDE / 2 / STEPS) + CENTRES[bucket]
     sh = rng.integers(0, 256, (N, 3 * TERMS[degree])) / 255 * (MOST - LEAST) + LEAST
+    quats = np.array([[3, 4, 0, 0], [0, 3, 4, 0], [4, 0, 3, 0], [5, 0, 0, 0]]) / 5
     return {
         "steps": steps, "means": means, "scales": 2.0 ** rng.integers(-9, 2, (N, 3)),
-        "quats": rng.integers(-8, 9, (N, 4)) / 8 + [2.0, 0, 0, 0],
+        "quats": quats[np.arange(N) % 4].astype(np.float16),
         "rgba": rng.integers(1, 255, (N, 4)), "sh": sh}
 
 
@@ -67,7 +73,7 @@ def test_each_compression_level_is_read(level: int, degree: int, tmp_path: Path)
     splats = scene.splats
     assert torch.allclose(splats.means.double(), torch.tensor(table["means"]), atol=1e-5)
     assert torch.allclose(splats.scales.double(), torch.tensor(table["scales"]), rtol=1e-6)
-    assert torch.allclose(splats.quats.double(), torch.tensor(table["quats"]))
+    assert torch.allclose(splats.quats.double(), torch.tensor(table["quats"]).double())
     assert torch.allclose(
         splats.opacities, torch.tensor(table["rgba"][:, 3] / 255).float(), atol=1e-6)
     colors = SH_C0 * splats.sh_dc + 0.5
@@ -85,6 +91,13 @@ def test_coefficients_lie_channel_after_channel_within_a_degree(tmp_path: Path) 
         second = torch.tensor(sh[:, 9 + 5 * channel: 14 + 5 * channel]).float()
         assert torch.equal(rest[:, :3, channel], first)
         assert torch.equal(rest[:, 3:, channel], second)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_spark_reads_the_same(level: int, page: WatchedPage, tmp_path: Path) -> None:
+    path = tmp_path / "room.ksplat"
+    path.write_bytes(ksplat(level, 2))
+    assert_spark_agrees(page, path, read_splats(path))
 
 
 def test_sections_are_read_one_after_the_other(tmp_path: Path) -> None:

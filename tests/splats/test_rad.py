@@ -7,15 +7,20 @@ import struct
 import zlib
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import torch
+from spark import assert_spark_agrees
 from splat_cases import damaged
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import SH_C0
 from recon_cli.splats.registry import load_splats, read_splats
+
+if TYPE_CHECKING:
+    from browser import WatchedPage
 
 N = 6
 FLOATS = {"center": "f32", "alpha": "f32", "rgb": "f32", "scales": "f32", "orientation": "f32",
@@ -129,6 +134,15 @@ def test_every_encoding_is_read(encodings: dict[str, str], error: float, tmp_pat
         assert abs(getattr(splats, name).numpy() - value).max() < error, name
     assert abs(splats.opacities.numpy() - table["alpha"][:, 0]).max() < error
     assert abs((SH_C0 * splats.sh_dc + 0.5).numpy() - table["rgb"]).max() < error
+
+
+@pytest.mark.parametrize("encodings", [FLOATS, HALVES, DEFAULT, OTHERS])
+def test_spark_reads_the_same(
+    encodings: dict[str, str], page: WatchedPage, tmp_path: Path
+) -> None:
+    path = tmp_path / "room.rad"
+    path.write_bytes(rad([chunk(values(), encodings)], N))
+    assert_spark_agrees(page, path, read_splats(path))
 
 
 def test_of_a_tree_the_ends_are_read_from_all_chunks(tmp_path: Path) -> None:
