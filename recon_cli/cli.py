@@ -35,6 +35,9 @@ VERBS = {
     "render": ("render.render", "Render the trained model along a path, or at given views."),
     "view": ("view.view", "View the trained scene in the browser."),
     "report": ("workspace.report", "Write an HTML report: capture, scores, views, settings."),
+    "convert": (
+        "convert.convert", "Convert, merge and reduce splat files, without a workspace."),
+    "info": ("convert.info", "Describe splat files: what they hold, and what is wrong with them."),
     "run": ("stages.run", "Run every stage from INPUT to a page that shows the scene."),
     "batch": ("batch.batch", "Reconstruct many captures, each in a workspace of its own."),
     "demo": ("stages.demo", "Run every stage on the bundled room video."),
