@@ -75,13 +75,15 @@ def describe_quality(
     failed = find_failed_views(metrics)
     if failed:
         others = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
-        faults.append(f"{name_view(failed[0].name, frames)}{others} failed")
+        faults.append(
+            f"{name_view(failed[0].name, frames)}{others} failed ({failed[0].psnr_db:.1f} dB)")
     if faults:
         word = FAIR
     if scores.psnr_db < POOR_PSNR_DB or (sfm is not None and sfm.trusted is False):
         word = POOR
-    text = ", ".join(facts) + "".join(f"; {fault}" for fault in faults)
-    return Quality(word, f"{text}; weak: {_find_weakest(metrics, model, trust, seen, frames)}")
+    weakest = _find_weakest(metrics, model, trust, seen, frames)
+    weak = [f"weak: {weakest}"] if weakest else []
+    return Quality(word, "; ".join([", ".join(facts), *faults, *weak]))
 
 
 def delivered_model(metrics: Metrics | None) -> str | None:
@@ -121,11 +123,15 @@ def _find_weakest(
     metrics: Metrics, model: str, trust: TrustRecord | None, seen: ModelTrust | None,
     frames: Sequence[Frame],
 ) -> str:
-    """Returns the largest poorly seen region, or else the view with the lowest PSNR, in words."""
+    """Returns the largest poorly seen region, or else the view with the lowest PSNR, in words.
+
+    Empty where that view failed, which is a fault.
+    """
     regions = trust.poorly_seen if trust and seen else ()
     if regions and regions[0].share >= _LARGE_REGION:
         region = regions[0]
         return (f"what {name_view(region.frame, frames)} shows, {region.share:.0%} of the "
                 f"surface: {region.cause}")
     worst = min(metrics.models[model].views, key=lambda view: view.psnr_db)
-    return f"{name_view(worst.name, frames)}, {worst.psnr_db:.1f} dB"
+    return "" if worst.psnr_db < POOR_PSNR_DB else (
+        f"{name_view(worst.name, frames)}, {worst.psnr_db:.1f} dB")

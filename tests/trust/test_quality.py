@@ -58,7 +58,7 @@ def test_a_large_region_that_is_poorly_seen_is_named_before_a_view():
     (metrics(31.0, ssim=0.85), 0.99, TRUSTED, "fair", "SSIM 0.85"),
     (metrics(31.0), 0.7, TRUSTED, "fair", "70% of the surface well seen; 90% or more are good"),
     (metrics(38.0, 38.0, 18.0), 0.99, TRUSTED, "fair", "2.png failed"),
-    (metrics(38.0, 38.0, 18.0, 17.0), 0.99, TRUSTED, "fair", "3.png and 1 more failed"),
+    (metrics(38.0, 38.0, 18.0, 17.0), 0.99, TRUSTED, "fair", "3.png and 1 more failed (17.0 dB)"),
     (metrics(31.0), 0.99, dataclasses.replace(TRUSTED, registered=60), "fair",
      "only 60 of 100 frames have a camera"),
     (metrics(21.0), 0.99, TRUSTED, "poor", "held-out views 21.0 dB"),
