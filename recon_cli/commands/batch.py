@@ -86,7 +86,7 @@ def batch(
     click.echo(f"The page of this table is {page}")
     done = [result.capture for result in results if result.succeeded]
     if done:
-        click.echo(f"next:   recon view -w {shlex.quote(str(out / done[0]))}")
+        click.echo(f"next:    recon view -w {shlex.quote(str(out / done[0]))}")
     failed = {result.capture: result.reason for result in results if not result.succeeded}
     if failed:
         raise ReconstructionError(

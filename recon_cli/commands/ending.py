@@ -18,6 +18,8 @@ from recon_cli.errors import ReconstructionError
 from recon_cli.progress import format_megabytes
 from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.records import read_frame_list
+from recon_cli.workspace.summaries import SfmSummary
 
 logger = logging.getLogger("recon")
 
@@ -25,6 +27,7 @@ logger = logging.getLogger("recon")
 def end_run(call: Call, *, open_page: bool = False) -> None:
     """Writes the report, and prints the results of a run that is complete."""
     from recon_cli.report.build import FILE, write_report
+    from recon_cli.trust.quality import read_quality
 
     job = open_job(call)
     folder = job.workspace.folder("export")
@@ -38,8 +41,13 @@ def end_run(call: Call, *, open_page: bool = False) -> None:
     click.echo("")
     for name, path in (("scene", folder / export.file), ("page", page), ("report", report)):
         if path is not None:
-            click.echo(f"{name + ':':8}{path} ({format_megabytes(path.stat().st_size)})")
-    click.echo(f"next:   {_next_command(call.workspace, page)}")
+            click.echo(f"{name + ':':9}{path} ({format_megabytes(path.stat().st_size)})")
+    sfm = job.workspace.manifest("sfm")
+    quality = read_quality(
+        job.workspace.folder("evaluate"), SfmSummary.from_json(sfm.run.summary) if sfm else None,
+        read_frame_list(job.workspace.folder("ingest")).frames)
+    click.echo(f"quality: {quality}")
+    click.echo(f"next:    {_next_command(call.workspace, page)}")
     if open_page:
         webbrowser.open((page or report).resolve().as_uri())
 

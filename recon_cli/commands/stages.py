@@ -117,7 +117,7 @@ def import_scene(call: Call, file: Path | None) -> None:
     run_stages(
         call, IMPORT.verb, [IMPORT.name], sources=() if file is None else (file,), table=table)
     if not call.print_config:
-        click.echo(f"next:   {name_workspace('recon view', call.workspace)} or "
+        click.echo(f"next:    {name_workspace('recon view', call.workspace)} or "
                    f"{name_workspace('recon export --format html', call.workspace)}")
 
 
