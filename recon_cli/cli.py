@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import shlex
 import sys
 import time
 from collections import UserDict
@@ -37,7 +38,10 @@ VERBS = {
     "render": ("render.render", "Render the trained model along a path, or at given views."),
     "view": ("view.view", "View the trained scene in the browser."),
     "report": ("workspace.report", "Write an HTML report: capture, scores, views, settings."),
-    "run": ("stages.run", "Run every stage from INPUT to the exported .ply."),
+    "convert": (
+        "convert.convert", "Convert, merge and reduce splat files, without a workspace."),
+    "info": ("convert.info", "Describe splat files: what they hold, and what is wrong with them."),
+    "run": ("stages.run", "Run every stage from INPUT to a page that shows the scene."),
     "batch": ("batch.batch", "Reconstruct many captures, each in a workspace of its own."),
     "demo": ("stages.demo", "Run every stage on the bundled room video."),
     "status": ("workspace.status", "Show which stages are fresh, stale and why, or missing."),
@@ -76,6 +80,20 @@ class _LazyGroup(click.Group):
             return super().invoke(ctx)
         except (KeyboardInterrupt, OSError) as error:
             raise _PastClick from error
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Returns the verb that was typed; where it is a capture, the error says what to type."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            word = args[0]
+            if not (Path(word).suffix or os.path.lexists(word)):
+                raise
+            raise console.HintedUsageError(
+                f"{word} is not a command.",
+                hint=f"To reconstruct it, type `recon run {shlex.quote(word)}`.") from error
 
     def list_commands(self, _ctx: click.Context) -> list[str]:
         """Returns the verbs."""

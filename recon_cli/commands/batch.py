@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -83,6 +84,9 @@ def batch(
     page = write_batch_page(results, out)
     click.echo(batch_text(results))
     click.echo(f"The page of this table is {page}")
+    done = [result.capture for result in results if result.succeeded]
+    if done:
+        click.echo(f"next:    recon view -w {shlex.quote(str(out / done[0]))}")
     failed = {result.capture: result.reason for result in results if not result.succeeded}
     if failed:
         raise ReconstructionError(

@@ -6,6 +6,7 @@ start (of a stage), of `recon_cli.progress`, or an `outcome`, of a stage that is
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import logging
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from recon_cli import progress
+from recon_cli.config.settings import SECTIONS
 from recon_cli.errors import ExitCode
 from recon_cli.progress import hide_bars
 
@@ -198,10 +200,38 @@ def result_object(
                        "output": output}, indent=1)
 
 
+class HintedUsageError(click.UsageError):
+    """A wrong command line, with what to type instead."""
+
+    def __init__(self, message: str, *, hint: str) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
 def usage_hint(error: click.ClickException) -> str:
-    """Returns which --help explains the verb that was typed; empty where none was."""
+    """Returns what to type instead, or which --help explains the verb; empty where none was."""
+    if isinstance(error, HintedUsageError):
+        return error.hint
+    if isinstance(error, click.NoSuchOption):
+        found = _setting(error)
+        if found:
+            return found
     ctx = error.ctx if isinstance(error, click.UsageError) else None
     return f"See `{ctx.command_path} --help`." if ctx else ""
+
+
+def _setting(error: click.NoSuchOption) -> str:
+    """Returns how an option of a stage is set in a verb that runs many; empty where it has none."""
+    if error.ctx is None or not any(
+            parameter.name == "assigned" for parameter in error.ctx.command.params):
+        return ""
+    name = error.option_name.lstrip("-").replace("-", "_")
+    sections = [section for section, config in SECTIONS.items()
+                if name in {item.name for item in dataclasses.fields(config)}]
+    if not sections:
+        return ""
+    ways = " or ".join(f"--set {section}.{name}=VALUE" for section in sections)
+    return f"{error.ctx.command_path} sets it by {ways}."
 
 
 def silence() -> None:

@@ -113,10 +113,13 @@ def _(scores: EvaluateSummary) -> str:
 @describe.register
 def _(export: ExportSummary) -> str:
     model = MODEL_LABELS.get(export.model, export.model)
+    others = [one for one in (export.files or {}).values() if not one.stale]
     return _join([
         f"{export.file} ({model} model, {export.gaussians:,} Gaussians, "
         f"{format_megabytes(export.bytes)})",
-        f"also {', '.join(fresh_files(export)[1:])}" if export.files else "",
+        "also " + ", ".join(
+            one.file + (f" ({format_megabytes(one.bytes)})" if one.bytes is not None else "")
+            for one in others) if others else "",
         f"NOT written: {', '.join(export.failed)}" if export.failed else ""])
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
+from recon_cli.commands.budget import run_within
+from recon_cli.commands.ending import end_run, name_workspace, optional_page
 from recon_cli.commands.jobs import open_job_with, run_stages
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.view import show_training
@@ -27,9 +29,10 @@ from recon_cli.stages import IMPORT, STAGES
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune midway through training
+RUN: Settings = {**MID, "export": {"format": "html"}}
 # Fewer steps than a capture of one's own gets: this room scores as 3DGS does after them already.
 # Surfaces by stereo would take a tenth of the time, for less than steps gain in it.
-DEMO: Settings = {**MID, "train": {"iterations": 1700, "stereo": "off"}}
+DEMO: Settings = {**RUN, "train": {"iterations": 1700, "stereo": "off"}}
 FORMS = ("text", "markdown", "csv", "latex", "json")
 
 _inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=options.PathType())
@@ -113,6 +116,9 @@ def import_scene(call: Call, file: Path | None) -> None:
     table = tuple(IMPORT if row.name == IMPORT.name else row for row in STAGES)
     run_stages(
         call, IMPORT.verb, [IMPORT.name], sources=() if file is None else (file,), table=table)
+    if not call.print_config:
+        click.echo(f"next:    {name_workspace('recon view', call.workspace)} or "
+                   f"{name_workspace('recon export --format html', call.workspace)}")
 
 
 def _parse_ratios(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[float, ...]:
@@ -194,19 +200,38 @@ def export(call: Call) -> None:
 @click.option(
     "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
     help="Also prune midway through training.  [default: on]")
+@click.option(
+    "--minutes", type=click.FloatRange(min=0.1), metavar="X",
+    help="Time for the whole run; frames, steps and pruning are chosen for it.  "
+         "[minutes; default: no limit]")
+@options.config_options(IngestConfig, only=("frames",))
+@options.config_options(TrainConfig, only=("quality",))
+@options.config_options(ExportConfig, only=("format", "title"))
+@click.option(
+    "--open", "with_open", is_flag=True,
+    help="Open the page of the scene in the browser at the end.  [default: off]")
 @options.assignments()
 @options.compute(trains=True)
 @options.again
 @options.print_config
 @options.common()
 @pass_call
-def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
-    """Run every stage from INPUT to the exported .ply.
+def run(
+    call: Call, inputs: tuple[Path, ...], with_prune: bool, minutes: float | None, with_open: bool
+) -> None:
+    """Run every stage from INPUT to a page that shows the scene.
 
-    INPUT is as for `recon ingest`. Without it, the previous input is used.
+    INPUT is as for `recon ingest`. Without it, the previous input is used. The results are the
+    scene (.ply), a page to look around in it (.html), and a report.
     """
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
-    run_stages(call, "run", stages, sources=inputs, base=MID)
+    with optional_page(call):
+        if minutes is not None and not call.print_config:
+            run_within(call, minutes, inputs, RUN, with_prune=with_prune)
+        else:
+            run_stages(call, "run", stages, sources=inputs, base=RUN)
+    if not call.print_config:
+        end_run(call, open_page=with_open)
 
 
 @verb("demo")
@@ -217,5 +242,6 @@ def run(call: Call, inputs: tuple[Path, ...], with_prune: bool) -> None:
 @pass_call
 def demo(call: Call) -> None:
     """Run every stage on the bundled room video."""
-    run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=DEMO)
-    click.echo(f"The scene is in {call.workspace / 'export' / 'splats.ply'}")
+    with optional_page(call):
+        run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=DEMO)
+    end_run(call)

@@ -33,8 +33,8 @@ class IngestConfig(StageConfig):
         0.5, "Minimum sharpness of a video frame relative to its neighbours.", unit="share",
         minimum=0.0, maximum=1.0)
     overlays: str = option(
-"mask", "Text, logos, dirt on the lens or a car's bonnet that stay in place in every frame of a "
-        "video: mask or keep them.", choices=("mask", "keep"))
+        "mask", "Text, logos, dirt on the lens or a car's bonnet that stay in place in every frame "
+        "of a video: mask or keep them.", choices=("mask", "keep"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

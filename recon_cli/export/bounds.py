@@ -13,9 +13,7 @@ _BULK = (0.05, 0.95)  # quantiles along each axis, between which the bulk lies
 def describe_bounds(splats: Splats) -> str:
     """Returns a warning about a scene that reaches much farther than its bulk; else empty."""
     means = splats.means.detach().double().cpu()
-    # torch.quantile takes 16 million values at most
-    order = means.sort(dim=0).values
-    low, high = (order[round(share * (len(means) - 1))] for share in _BULK)
+    low, high = find_bulk(means)
     bulk, alone = float((high - low).max()), _reach(means)
     across = _reach(splats.with_sphere().means.double().cpu())
     if not across > _FAR * bulk or not bulk:
@@ -28,6 +26,13 @@ def describe_bounds(splats: Splats) -> str:
     if alone > _FAR * bulk:
         text += " --crop cuts off everything outside a box."
     return text
+
+
+def find_bulk(means: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the lowest and the highest corner [3] of the box that the bulk [N, 3] lies in."""
+    order = means.sort(dim=0).values  # torch.quantile takes 16 million values at most
+    low, high = (order[round(share * (len(means) - 1))] for share in _BULK)
+    return low, high
 
 
 def _reach(means: Tensor) -> float:

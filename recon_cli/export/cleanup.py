@@ -49,6 +49,8 @@ _FEW = 2  # views
 _IN_FRONT = 0.5  # of the depth of the surface behind
 _SOLID = 0.5  # coverage from which something counts as behind
 _HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
+_FAINT = 0.1  # opacity; without views only such a large Gaussian counts as haze
+_HAZE = 0.1  # of the distance from the middle, at least of the radius
 _WORST = 0.2  # of the greatest harm: the threshold of a round
 _ROUNDS = 12
 
@@ -84,6 +86,31 @@ def drop_islands(
         on_device = splats.map(lambda tensor: tensor.to(ctx.device))
         visible = count_sightings(on_device, views, backend=ctx.backend).cpu() > 0
     return _drop(splats, find_islands(splats, near, visible), "--drop-islands")
+
+
+def drop_floaters_without_views(splats: Splats, room: tuple[list[float], float]) -> Splats:
+    """Returns a scene without floaters, as far as they can be told without views, and logs them.
+
+    These are Gaussians too faint to be drawn, haze (faint ones that are large for their distance
+    from the middle of the room), and those in the room that touch no other. `room` is its middle
+    [3] and radius. ConfigError if nothing would be left.
+    """
+    means, opacities = splats.means.detach().double(), splats.opacities.detach()
+    invisible = opacities < _VISIBLE
+    away = (means - means.median(dim=0).values).norm(dim=1)
+    bulk = away.sort().values[round(_BULK * (len(away) - 1))]
+    large = splats.scales.detach().amax(dim=1) > _HAZE * away.clamp_min(bulk)
+    haze = (opacities < _FAINT) & large & ~invisible
+    alone = torch.zeros_like(invisible)
+    rows = torch.nonzero(splats.within(*room) & ~invisible)[:, 0]
+    if len(rows) > _NEIGHBOURS:
+        group = _find_groups(means[rows].cpu().numpy(), splats.select(rows))
+        alone[rows] = torch.from_numpy(np.bincount(group)[group] == 1).to(rows.device)
+    alone &= ~haze
+    logger.info(
+        "floaters: %d Gaussians that are too faint to be drawn, %d faint and large, %d that touch "
+        "no other", int(invisible.sum()), int(haze.sum()), int(alone.sum()))
+    return _drop(splats, invisible | haze | alone, "--drop-floaters")
 
 
 def _drop(splats: Splats, removed: Tensor, option: str) -> Splats:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import math
 import shutil
-import tempfile
 from functools import cached_property
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from recon_cli.datasets.transforms import write_transforms
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.export.reduce import lower_degrees
 from recon_cli.export.source import ExportSource
+from recon_cli.export.verify import file_size, measure_size, write_until_good
 from recon_cli.io.colmap import write_colmap
 from recon_cli.io.meshes import write_point_cloud
 from recon_cli.room.files import write_mesh_file, write_plan
@@ -26,7 +25,6 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import write_points
-from recon_cli.splats.registry import FORMATS
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
 from recon_cli.workspace.export_record import ExportedFile, max_loss_db
 
@@ -36,7 +34,7 @@ _SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
 logger = logging.getLogger("recon")
 
 
-def measure_size(splats: Splats, config: ExportConfig, source: ExportSource) -> int:
+def measure_first(splats: Splats, config: ExportConfig, source: ExportSource) -> int:
     """Returns the bytes that a scene takes in the first format that is asked for.
 
     ConfigError if the format does not hold Gaussians.
@@ -46,11 +44,7 @@ def measure_size(splats: Splats, config: ExportConfig, source: ExportSource) -> 
         raise ConfigError(
             f"--max-mb limits the first format, but {row.name} does not hold Gaussians.",
             hint="Name ply, spz or another one of Gaussians first in --format.")
-    with tempfile.TemporaryDirectory(prefix="recon-size-") as folder:
-        path = Path(folder) / row.file
-        cut = splats.with_degree(min(row.sh_degree, splats.sh_degree))
-        FORMATS[row.name].write(path, cut, _settings(row, config, source))
-        return _file_size(row, path)
+    return measure_size(row, splats, _settings(row, config, source))
 
 
 def _settings(row: ExportFormat, config: ExportConfig, source: ExportSource) -> WriteSettings:
@@ -85,13 +79,19 @@ class FormatWriter:
                 centers = [camera.center for _, camera in self._source.place(
                     self._source.scene.train)]
                 write_plan(self._out, self._mesh, np.stack(centers), self._room_frame)
-        return ExportedFile(file=row.file)
+        path = self._out / row.file
+        return ExportedFile(file=row.file, bytes=path.stat().st_size if path.is_file() else None)
 
     def _write_gaussians(self, row: ExportFormat) -> ExportedFile:
         path = self._out / row.file
         most = max_loss_db(row.name, dataclasses.asdict(self._config))
-        gain = self._write_until_good(row, path, most)
-        size, ply_size = _file_size(row, path), (self._out / "splats.ply").stat().st_size
+        limited = self._config.max_mb is not None and row.name == self._config.formats[0]
+        gain = write_until_good(
+            row, path, lower_degrees(self._splats, self._source).at(row.sh_degree),
+            _settings(row, self._config, self._source), self._source.psnr,
+            reference_db=self._psnr_db, most_db=most,
+            max_bytes=int(1e6 * (self._config.max_mb or 0)) if limited else None)
+        size, ply_size = file_size(row, path), (self._out / "splats.ply").stat().st_size
         text = f"{row.name}: {ply_size / size:.1f}x smaller, {gain:+.2f} dB"
         if not gain >= -most:  # a NaN fails too
             raise ReconstructionError(
@@ -101,21 +101,6 @@ class FormatWriter:
         return ExportedFile(
             file=row.file, bytes=size, smaller=round(ply_size / size, 3),
             psnr_change_db=round(gain, 4))
-
-    def _write_until_good(self, row: ExportFormat, path: Path, most: float) -> float:
-        """Writes a file with ever less sharing, and returns its gain in dB over the scene."""
-        form, settings = FORMATS[row.name], _settings(row, self._config, self._source)
-        splats = lower_degrees(self._splats, self._source).at(row.sh_degree)
-        limited = self._config.max_mb is not None and row.name == self._config.formats[0]
-        gain = -math.inf
-        for sharing in row.sharing:
-            form.write(path, splats, dataclasses.replace(settings, sharing=sharing))
-            if limited and _file_size(row, path) > 1e6 * (self._config.max_mb or 0):
-                break
-            gain = self._source.psnr.psnr_db(form.read(path)) - self._psnr_db
-            if gain >= -most:
-                break
-        return gain
 
     @cached_property
     def _psnr_db(self) -> float:
@@ -130,13 +115,6 @@ class FormatWriter:
             self._splats.map(lambda tensor: tensor.to(source.ctx.device)), source.load_training(),
             source.points if measured else None, source.ctx,
             max_triangles=self._config.max_triangles, voxel=self._config.voxel)
-
-
-def _file_size(row: ExportFormat, path: Path) -> int:
-    """Returns the bytes of a scene: of its file, or of all beside a lod-meta.json."""
-    if "/" not in row.file:
-        return path.stat().st_size
-    return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
 
 
 def _write_cameras(out: Path, row: ExportFormat, source: ExportSource) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,7 +14,6 @@ from torch import Tensor
 from recon_cli.config.stages import ExportConfig
 from recon_cli.errors import ConfigError
 from recon_cli.export.cleanup import drop_floaters, drop_islands
-from recon_cli.export.source import ExportSource
 from recon_cli.io.images import fit_camera
 from recon_cli.io.views import evenly_spread
 from recon_cli.render import render
@@ -21,8 +21,10 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.importance import Importance, add_views
-from recon_cli.train.prune_loop import survivors
 from recon_cli.workspace.export_record import ExportChange
+
+if TYPE_CHECKING:  # the readers of views, which `recon convert` starts without
+    from recon_cli.export.source import ExportSource
 
 Box = tuple[float, float, float, float, float, float]  # x, y, z of the lowest corner, the highest
 
@@ -63,18 +65,32 @@ def reduce_scene(
     if config.max_mb is not None:
         splats = step("max_mb", fit_to_size(
             splats, int(1e6 * config.max_mb), size_of=size_of,
-            score_of=partial(_score, source=source), at_degree=lower_degrees(splats, source).at,
+            fewer=_HighestScores(splats, source).take, at_degree=lower_degrees(splats, source).at,
             psnr_db=source.psnr.psnr_db))
     return splats, changes
 
 
-def _score(splats: Splats, *, source: ExportSource) -> Tensor:
-    """Returns how much each Gaussian matters to the training views, [N]."""
-    on_device = splats.map(lambda tensor: tensor.to(source.ctx.device))
-    importance = Importance.of_score(_SCORE, len(on_device), on_device.means.device)
-    add_views(importance, on_device, source.load_training(),
-              sh_degree=on_device.sh_degree, backend=source.ctx.backend)
-    return importance.score(_SCORE, on_device, beta=0.0, generator=torch.Generator()).cpu()
+class _HighestScores:
+    """The Gaussians of a scene that matter most to the training views."""
+
+    def __init__(self, splats: Splats, source: ExportSource) -> None:
+        self._splats, self._source = splats, source
+
+    def take(self, scene: Splats, count: int) -> Splats:
+        """Returns as many of the scene, which may be in another degree."""
+        from recon_cli.train.prune_loop import survivors  # imports the whole training
+
+        return scene.select(survivors(self._score, count))
+
+    @cached_property
+    def _score(self) -> Tensor:
+        """How much each Gaussian matters to the training views, [N]."""
+        source = self._source
+        splats = self._splats.map(lambda tensor: tensor.to(source.ctx.device))
+        importance = Importance.of_score(_SCORE, len(splats), splats.means.device)
+        add_views(importance, splats, source.load_training(),
+                  sh_degree=splats.sh_degree, backend=source.ctx.backend)
+        return importance.score(_SCORE, splats, beta=0.0, generator=torch.Generator()).cpu()
 
 
 def measure_change(
@@ -177,21 +193,19 @@ def lower_degrees(splats: Splats, source: ExportSource) -> LowerDegrees:
 
 def fit_to_size(
     splats: Splats, max_bytes: int, *, size_of: Callable[[Splats], int],
-    score_of: Callable[[Splats], Tensor], at_degree: Callable[[int], Splats],
+    fewer: Callable[[Splats, int], Splats], at_degree: Callable[[int], Splats],
     psnr_db: Callable[[Splats], float],
 ) -> Splats:
     """Returns the scene reduced to a file size, by the degree and count that look best together.
 
-    For each degree as many Gaussians of the highest scores as fit; of these scenes the one with the
-    highest PSNR, on views that the scores do not use. `score_of` returns how much each Gaussian
-    matters, [N], and is called at most once; `at_degree` returns the scene in a lower degree.
+    For each degree as many Gaussians as fit; of these scenes the one with the highest PSNR.
+    `fewer` returns a scene with at most so many Gaussians, `at_degree` the scene in a lower degree.
     ConfigError if not even one Gaussian fits.
     """
     if size_of(splats) <= max_bytes:
         return splats
-    score = score_of(splats)
     degrees = range(splats.sh_degree, -1, -1)
-    candidates = (_fit_count(at_degree(degree), max_bytes, size_of, score) for degree in degrees)
+    candidates = (_fit_count(at_degree(degree), max_bytes, size_of, fewer) for degree in degrees)
     fitting = [scene for scene in candidates if scene is not None]
     if not fitting:
         raise ConfigError(
@@ -201,12 +215,13 @@ def fit_to_size(
 
 
 def _fit_count(
-    splats: Splats, max_bytes: int, size_of: Callable[[Splats], int], score: Tensor
+    splats: Splats, max_bytes: int, size_of: Callable[[Splats], int],
+    fewer: Callable[[Splats, int], Splats],
 ) -> Splats | None:
-    """Returns as many Gaussians of the highest scores as fit; None if not even one does."""
+    """Returns as many Gaussians as fit; None if not even one does."""
     count = len(splats)
     while count:
-        best = splats if count == len(splats) else splats.select(survivors(score, count))
+        best = splats if count == len(splats) else fewer(splats, count)
         size = size_of(best)
         if size <= max_bytes:
             return best

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import torch
 
@@ -16,12 +19,58 @@ from recon_cli.io.views import MASK_HINT, ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, with_rows
+from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import read_ply
+from recon_cli.splats.registry import FORMATS
+from recon_cli.workspace.export_formats import ExportFormat
 
 _VIEWS = 8  # rendered for each file, at most
 
 
-def verify_ply(path: Path, splats: Splats) -> None:
+class Psnr(Protocol):
+    """A measure of scenes: PSNR on known views."""
+
+    def psnr_db(self, splats: Splats) -> float:
+        """Returns the mean over the views in dB."""
+        ...
+
+
+def write_until_good(
+    row: ExportFormat, path: Path, splats: Splats, settings: WriteSettings, psnr: Psnr, *,
+    reference_db: float, most_db: float, max_bytes: int | None = None,
+) -> float:
+    """Writes a file with ever less sharing, and returns its gain in dB over `reference_db`.
+
+    It stops where no more than `most_db` are lost, or the file is larger than `max_bytes`.
+    """
+    form, gain = FORMATS[row.name], -math.inf
+    for sharing in row.sharing:
+        form.write(path, splats, dataclasses.replace(settings, sharing=sharing))
+        if max_bytes is not None and file_size(row, path) > max_bytes:
+            break
+        gain = psnr.psnr_db(form.read(path)) - reference_db
+        if gain >= -most_db:
+            break
+    return gain
+
+
+def measure_size(row: ExportFormat, splats: Splats, settings: WriteSettings) -> int:
+    """Returns the bytes that a scene takes in a format of Gaussians."""
+    with tempfile.TemporaryDirectory(prefix="recon-size-") as folder:
+        path = Path(folder) / row.file
+        cut = splats.with_degree(min(row.sh_degree, splats.sh_degree))
+        FORMATS[row.name].write(path, cut, settings)
+        return file_size(row, path)
+
+
+def file_size(row: ExportFormat, path: Path) -> int:
+    """Returns the bytes of a scene: of its file, or of all beside a lod-meta.json."""
+    if "/" not in row.file:
+        return path.stat().st_size
+    return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+
+
+def verify_ply(path: Path, splats: Splats, *, again: str = "run `recon export --again`") -> None:
     """Raises WorkspaceError unless a .ply reads back as exactly these Gaussians."""
     back = read_ply(path).with_degree(splats.sh_degree)
     for name, value in splats.parameters().items():
@@ -31,7 +80,7 @@ def verify_ply(path: Path, splats: Splats) -> None:
         if not torch.equal(read, value):
             raise WorkspaceError(
                 f"{path} reads back with a different {name} than was written.",
-                hint="Check the disk, then run `recon export --again`.")
+                hint=f"Check the disk, then {again}.")
 
 
 @dataclass(frozen=True, eq=False)

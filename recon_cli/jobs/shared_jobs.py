@@ -101,10 +101,11 @@ def describe_failures(failed: Mapping[str, str], total: int, noun: str) -> str:
 
 def _as_they_end(futures: Iterable[Future[JobEnd]]) -> Iterator[Future[JobEnd]]:
     """Yields futures as they end; Ctrl-C on Windows waits for the end of a wait."""
-    left = set(futures)
+    left = list(futures)
     while left:
-        done, left = wait(left, timeout=_LOOK_SECONDS, return_when=FIRST_COMPLETED)
-        yield from done
+        done, _ = wait(left, timeout=_LOOK_SECONDS, return_when=FIRST_COMPLETED)
+        yield from (future for future in left if future in done)
+        left = [future for future in left if future not in done]
 
 
 def _look(job: SharedJob) -> tuple[float, str]:

@@ -212,10 +212,10 @@ def _read_last_sources(job: Job, row: Stage) -> tuple[Source, ...]:
     """Returns the sources of the previous run as they are now."""
     sources = last_sources(job, row.name)
     if not sources:
+        verb = "run" if len(job.asked) > 1 else row.verb
         raise ConfigError(
-            f"{row.verb} needs an input: none was given, and {job.workspace.root} has no "
-            "previous one.",
-            hint=f"Type `recon {row.verb} {row.input_metavar}`"
+            f"{verb} needs an input: none was given, and {job.workspace.root} has no previous one.",
+            hint=f"Type `recon {verb} {row.input_metavar}`"
             f"{', or a folder of photos in place of VIDEO' * (row.input_metavar == 'VIDEO')}.")
     return tuple(
         read_source(Path(source.path), known=source, without=job.workspace.root)

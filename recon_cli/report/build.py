@@ -30,6 +30,7 @@ from recon_cli.report.gallery import (
     legend_stops,
 )
 from recon_cli.report.headline import build_headline, format_facts
+from recon_cli.report.opening import build_opening
 from recon_cli.report.parts import read_parts
 from recon_cli.report.records import build_scores, read_metrics
 from recon_cli.report.room import read_room
@@ -40,6 +41,7 @@ from recon_cli.report.stage_status import (
     read_provenance,
 )
 from recon_cli.report.trust_section import read_trust
+from recon_cli.splats.html import ICON
 from recon_cli.workspace import atomic
 from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.layout import disk_errors
@@ -60,7 +62,7 @@ ManifestError if its manifest cannot be trusted; ConfigError if `out` is not an 
     path = (job.workspace.root / FILE if out is None else out).absolute()
     _check_path(job, path)
     with disk_errors(job.workspace.root, "reading the workspace"):
-        page = build_report(job)
+        page = build_report(job, path.parent)
     try:
         with disk_errors(path.parent, "writing the report"):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,8 +94,11 @@ def _check_path(job: Job, path: Path) -> None:
                 hint="Give a file elsewhere with -o.")
 
 
-def build_report(job: Job) -> bytes:
-    """Returns the page of a workspace in UTF-8, at most MAX_FILE_BYTES long."""
+def build_report(job: Job, folder: Path) -> bytes:
+    """Returns the page of a workspace in UTF-8, at most MAX_FILE_BYTES long.
+
+    `folder` is where it will be, which its links to files start from.
+    """
     stages = inspect_stages(job)
     metrics, damaged = None, ""
     if stages["evaluate"].there:
@@ -101,7 +106,7 @@ def build_report(job: Job) -> bytes:
             metrics = read_metrics(stages["evaluate"].folder)
         except FormatError as error:
             damaged = f"The scores are not shown: {error.message}"
-    values = _template_values(job, stages, metrics, damaged)
+    values = _template_values(job, stages, metrics, damaged, folder)
     views = sum(len(model.views) for model in metrics.models.values()) if metrics else 0
     if not views or metrics is None:
         return _render_page(values, Gallery())
@@ -112,15 +117,15 @@ def build_report(job: Job) -> bytes:
 
 
 def _template_values(
-    job: Job, stages: StageReports, metrics: Metrics | None, damaged: str
+    job: Job, stages: StageReports, metrics: Metrics | None, damaged: str, folder: Path
 ) -> dict[str, Any]:
     """Returns the template's values, except for the views."""
-    root = job.workspace.root
+    root, opening = job.workspace.root, build_opening(stages, metrics, folder)
     runs = [stage.manifest.run for stage in stages.values() if stage.manifest]
     return {
-        "name": root.resolve().name, "stages": stages,
+        "stages": stages, "opening": opening,
         "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"),
-        "headline": build_headline(stages, metrics), "capture": read_capture(stages),
+        "headline": build_headline(stages, metrics, opening.trust), "capture": read_capture(stages),
         "parts": read_parts(stages),
         "trust": read_trust(stages),
         "curves": draw_training_curves(stages, metrics),
@@ -133,7 +138,7 @@ def _template_values(
         "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),
         "longest": max(run.seconds for run in runs),
         "largest": max(run.peak_memory_bytes for run in runs),
-        "gain": GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),
+        "icon": ICON, "gain": GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),
     }
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recon_cli.evaluation.scores import Metrics
+from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.records import BASE, PRUNED
 from recon_cli.report.stage_status import StageReport, StageReports
+from recon_cli.trust.quality import delivered_model, find_failed_views
+from recon_cli.trust.scene_trust import TrustRecord
 from recon_cli.workspace.summaries import IngestSummary, PruneSummary, SfmSummary, TrainSummary
 
 _KINDS = {
@@ -53,7 +55,9 @@ class Headline:
     gone: tuple[str, ...]  # inputs that no longer exist
 
 
-def build_headline(stages: StageReports, metrics: Metrics | None) -> Headline:
+def build_headline(
+    stages: StageReports, metrics: Metrics | None, trust: TrustRecord | None = None
+) -> Headline:
     """Returns the top of the page of a workspace that has an ingest."""
     ingest = stages["ingest"]
     sources = ingest.manifest.key.sources if ingest.manifest else ()
@@ -61,11 +65,12 @@ def build_headline(stages: StageReports, metrics: Metrics | None) -> Headline:
     kind = summary.kind if summary else ""
     return Headline(
         _KINDS.get(kind, kind), tuple(Path(source.path).name for source in sources),
-        tuple(_build_tiles(stages, metrics)), judge_poses(stages["sfm"]), ingest.gone)
+        tuple(_build_tiles(stages, metrics, trust)),
+        judge_poses(stages["sfm"], find_failed_views(metrics)), ingest.gone)
 
 
-def judge_poses(sfm: StageReport) -> PosesVerdict:
-    """Returns the verdict of sfm on its own result."""
+def judge_poses(sfm: StageReport, failed: Sequence[ViewScore] = ()) -> PosesVerdict:
+    """Returns the verdict of sfm on its own result, unless views that failed contradict it."""
     if not sfm.there:
         return PosesVerdict("unknown", "There are no camera poses yet.")
     summary = sfm.read_summary(SfmSummary)
@@ -95,33 +100,41 @@ def judge_poses(sfm: StageReport) -> PosesVerdict:
         return PosesVerdict("warn", (
             f"Only a part of the capture is kept, whose camera poses can be trusted: {count}; "
             f"{left_out:,} are left out whose cameras could not be trusted."), lines)
+    if failed:
+        others = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
+        return PosesVerdict("warn", (
+            f"{count}, and the mapping found no fault in them. But {failed[0].name}{others} failed "
+            f"({failed[0].psnr_db:.1f} dB): its camera may be wrong, see Views."), lines)
     return PosesVerdict("good", f"The camera poses can be trusted: {count}.", lines)
 
 
-def _build_tiles(stages: StageReports, metrics: Metrics | None) -> Iterator[Tile]:
+def _build_tiles(
+    stages: StageReports, metrics: Metrics | None, trust: TrustRecord | None
+) -> Iterator[Tile]:
     ingest, sfm, train, prune = (stages[name] for name in ("ingest", "sfm", "train", "prune"))
-    frames = ingest.read_summary(IngestSummary)
-    yield Tile("frames", f"{frames.frames:,}" if frames else _LACKING, (
-        f"{frames.width}x{frames.height}, {frames.held_out:,} held out" if frames
-        else "cannot be read"), not ingest.fresh)
-    cameras = sfm.read_summary(SfmSummary)
-    share = (f"{cameras.registered / cameras.frames:.0%} of the frames"
-             if cameras and cameras.frames else "")
+    yield from _score_tiles(stages["evaluate"], metrics, trust)
+    frames, cameras = ingest.read_summary(IngestSummary), sfm.read_summary(SfmSummary)
+    detail = (f"{frames.width}x{frames.height}, {frames.held_out:,} held out" if frames
+              else "cannot be read")
     if cameras and cameras.part is not None:
-        share += f", part {cameras.part} of {len(cameras.parts)}"
+        detail += f", part {cameras.part} of {len(cameras.parts)}"
     elif cameras and cameras.left_out:
-        share += f", {len(cameras.left_out):,} left out"
+        detail += f", {len(cameras.left_out):,} left out"
+    if cameras:
+        yield Tile("cameras", f"{cameras.registered:,} of {cameras.frames:,}", detail,
+                   not (sfm.fresh and ingest.fresh))
+    else:
+        yield Tile("frames", f"{frames.frames:,}" if frames else _LACKING, detail, not ingest.fresh)
+    model = prune if prune.there else train
+    original = f"original {_count(train, TrainSummary)}" if prune.there and train.there else ""
+    if original and model.fresh:  # if the compact one is stale too, its tile says so already
+        original += train.stale_suffix
     yield _stage_tile(
-        sfm, "registered", f"{cameras.registered:,}" if cameras else _LACKING, share)
-    pruned = f"compact {_count(prune, PruneSummary)}" if prune.there else ""
-    if pruned and train.fresh:  # if training is stale too, its tile says so already
-        pruned += prune.stale_suffix
-    yield _stage_tile(train, "Gaussians", _count(train, TrainSummary), pruned)
-    yield from _score_tiles(stages["evaluate"], metrics)
-    run = train.manifest.run if train.manifest else None
-    yield _stage_tile(
-        train, "training", format_duration(run.seconds) if run else "",
-        f"peak {format_megabytes(run.peak_memory_bytes)}" if run else "")
+        model, "Gaussians", _count(model, PruneSummary if prune.there else TrainSummary), original)
+    runs = [stage.manifest.run for stage in stages.values() if stage.manifest]
+    own = f"training {format_duration(train.manifest.run.seconds)}" if train.manifest else ""
+    yield Tile("time", format_duration(sum(run.seconds for run in runs)), own,
+               train.there and not train.fresh)
 
 
 def _stage_tile(stage: StageReport, label: str, value: str, detail: str) -> Tile:
@@ -135,17 +148,22 @@ def _count(stage: StageReport, kind: type[TrainSummary] | type[PruneSummary]) ->
     return f"{summary.gaussians:,}" if summary else _LACKING
 
 
-def _score_tiles(evaluate: StageReport, metrics: Metrics | None) -> Iterator[Tile]:
-    if metrics is None or not metrics.models:
+def _score_tiles(
+    evaluate: StageReport, metrics: Metrics | None, trust: TrustRecord | None
+) -> Iterator[Tile]:
+    model = delivered_model(metrics)
+    if metrics is None or model is None:
         text = "cannot be read" if evaluate.there else f"evaluate is {evaluate.state}"
-        yield from (Tile(f"held-out {name}", _LACKING, text) for name in ("PSNR", "SSIM"))
+        yield Tile("held-out views", _LACKING, text)
         return
-    first = next(iter(metrics.models.values()))
-    pruned = metrics.models.get(PRUNED) if BASE in metrics.models else None
-    yield Tile("held-out PSNR", f"{first.psnr_db:.2f} dB",
-               f"compact {pruned.psnr_db:.2f} dB" if pruned else "", not evaluate.fresh)
-    yield Tile("held-out SSIM", f"{first.ssim:.4f}",
-               f"compact {pruned.ssim:.4f}" if pruned else "", not evaluate.fresh)
+    scores = metrics.models[model]
+    original = metrics.models.get(BASE) if model == PRUNED else None
+    yield Tile("held-out views", f"{scores.psnr_db:.2f} dB", ", ".join([
+        f"SSIM {scores.ssim:.3f}", *([f"original {original.psnr_db:.2f} dB"] if original else [])]),
+        not evaluate.fresh)
+    seen = trust.model_trust(model) if trust else None
+    if seen is not None:
+        yield Tile("well seen", f"{seen.surface.well:.0%}", "of the surface", not evaluate.fresh)
 
 
 def format_facts(summary: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

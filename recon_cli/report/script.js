@@ -11,7 +11,8 @@ function tabs() {
       document.getElementById(tab.getAttribute("aria-controls")).classList.toggle("open", chosen);
     }
     if (focus) button.focus();
-    button.scrollIntoView({ block: "nearest", inline: "nearest" });
+    // along the row alone: the page opens at its top
+    button.parentElement.scrollLeft = button.offsetLeft + button.offsetWidth - button.parentElement.clientWidth;
     // show a section from its top, however far the last one was scrolled
     const main = document.querySelector("main");
     if (main.getBoundingClientRect().top < 0) window.scrollTo(0, main.offsetTop - button.offsetHeight - 4);

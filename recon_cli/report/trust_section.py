@@ -8,6 +8,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.scores import Table
 from recon_cli.io.images import fit_image, read_png
@@ -84,20 +85,21 @@ def _surface_table(models: dict[str, ModelTrust]) -> Table:
     return Table(
         ("model", "well seen", "from one direction only", f"by fewer than {MIN_VIEWS} views",
          "training views"),
-        tuple((name, f"{trust.surface.well:.1%}", f"{trust.surface.narrow:.1%}",
+        tuple((MODEL_LABELS[name], f"{trust.surface.well:.1%}", f"{trust.surface.narrow:.1%}",
                f"{trust.surface.few:.1%}", f"{trust.views:,}") for name, trust in models.items()))
 
 
 def _agreement_table(models: dict[str, ModelTrust]) -> Table | None:
-    rows = [(name, f"{found.ause:.3f}", f"{found.ause_opacity:.3f}", f"{found.ause_depth:.3f}",
-             f"{found.gap:.0%}", f"{found.views:,}")
+    rows = [(MODEL_LABELS[name], f"{found.ause:.3f}", f"{found.ause_opacity:.3f}",
+             f"{found.ause_depth:.3f}", f"{found.gap:.0%}", f"{found.views:,}")
             for name, trust in models.items() if (found := trust.agreement) is not None]
     return Table(("model", "AUSE", "AUSE of opacity", "AUSE of depth", "gap of ten bins",
                   "held-out views"), rows) if rows else None
 
 
 def _draw_reliability(models: dict[str, ModelTrust]) -> Markup | None:
-    lines = [Series(name, tuple(zip(found.expected, found.real, strict=True)), 2 * number, "circle")
+    lines = [Series(MODEL_LABELS[name], tuple(zip(found.expected, found.real, strict=True)),
+                    2 * number, "circle")
              for number, (name, trust) in enumerate(models.items())
              if (found := trust.agreement) is not None]
     if not lines:

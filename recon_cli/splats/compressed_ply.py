@@ -21,7 +21,7 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.splats.foreign import count_terms, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
-from recon_cli.splats.ply import is_antialiased, read_up
+from recon_cli.splats.ply import describe_writer, is_antialiased, read_up
 from recon_cli.splats.ply_tables import Element, format_header, read_header, read_tables
 from recon_cli.splats.values import (
     Bytes,
@@ -174,7 +174,8 @@ def load_compressed_ply(path: Path) -> LoadedScene:
         "sh_rest": _harmonics(path, tables, n),
     })
     return LoadedScene(
-        splats_from_arrays(path, columns), read_up(header), is_antialiased(header))
+        splats_from_arrays(path, columns), read_up(header), is_antialiased(header),
+        writer=describe_writer(header))
 
 
 def _property_types(element: Element) -> dict[str, str]:

@@ -48,6 +48,7 @@ class LoadedScene:
     up: str | None = None  # axis that the file says is up: z, -y or y; None if it does not
     antialiased: bool = False  # the file says: trained with antialiasing (Mip-Splatting)
     origin: Origin | None = None  # subtracted from all positions; None if nothing was
+    writer: str = ""  # what the file says of the program that wrote it; empty if nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +89,8 @@ class SplatFormat:
 
     load: Callable[[Path], LoadedScene]  # raises FormatError
     # Writes a file, whole or not at all, with the backdrop as Gaussians where the format has no
-    # room for one; raises FormatError or InputError if a value does not fit.
-    write_with: Callable[[Path, Splats, WriteSettings], None]
+    # room for one; raises FormatError or InputError if a value does not fit. None: it is only read.
+    write_with: Callable[[Path, Splats, WriteSettings], None] | None = None
     # loads a scene without the turn that the file asks for; None where it cannot ask for any
     load_unturned: Callable[[Path], LoadedScene] | None = None
 
@@ -99,4 +100,5 @@ class SplatFormat:
 
     def write(self, path: Path, splats: Splats, settings: WriteSettings | None = None) -> None:
         """Writes a file, whole or not at all."""
+        assert self.write_with is not None, "a format that is only read"
         self.write_with(path, splats, settings or WriteSettings())

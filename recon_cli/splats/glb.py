@@ -187,7 +187,9 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
     if axes is None:
         axes = _AXES.get(_read_axes(container.json), Z_UP)
     up = next((name for name, known in _UP.items() if np.array_equal(known, axes)), None)
-    return LoadedScene(transformed(splats, Similarity(rotation=axes.T)), up)
+    return LoadedScene(
+        transformed(splats, Similarity(rotation=axes.T)), up,
+        writer=container.generator(container.json))
 
 
 def _read_axes(value: Mapping[str, Any]) -> str:

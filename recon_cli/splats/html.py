@@ -34,7 +34,7 @@ from recon_cli.splats.values import read_contents
 from recon_cli.workspace.atomic import write_bytes
 
 View = tuple[str, Camera]
-_ICON = (
+ICON = (
     "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E%3Crect "
     "width='32' height='32' rx='7' fill='%23223'/%3E%3Cellipse cx='12' cy='19' rx='8' ry='4' "
     "fill='%23e8a33d' transform='rotate(-25 12 19)'/%3E%3Cellipse cx='20' cy='13' rx='8' ry='4' "
@@ -109,7 +109,7 @@ def build_page(
         '<img id="poster" alt="" src="data:image/jpeg;base64,'
         f'{base64.b64encode(style.poster).decode("ascii")}">')
     text = Template(_text("page.html")).substitute(
-        title=title, preview=_preview(title, style.preview), icon=_ICON, poster=poster,
+        title=title, preview=_preview(title, style.preview), icon=ICON, poster=poster,
         credits='<span id="credits">made with recon</span>' if style.credits else "",
         scene=scene, views=_views(views, splats, up, style.tour),
         licences="\n".join(f"{name}\n{_text(name)}" for name in LICENCES),
@@ -255,7 +255,7 @@ def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
     if guide is not None:
         write_bytes(preview, guide.poster)
     style = PageStyle(
-        settings.options.get("title") or _find_title(settings.title),
+        settings.options.get("title") or find_title(settings.title),
         guide.tour if guide else None, guide.poster if guide else None,
         preview.name if guide else None, bool(settings.options.get("credits")))
     write_html(
@@ -263,7 +263,7 @@ def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
         up=Z_UP if settings.up is None else settings.up, views=settings.views)
 
 
-def _find_title(name: str) -> str:
+def find_title(name: str) -> str:
     """Returns a title from the name of a capture's file or folder, unless a camera made it up."""
     stem = PurePath(name).stem
     words = re.sub(r"[\s_-]+", " ", stem).strip()

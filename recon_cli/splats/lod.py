@@ -68,10 +68,7 @@ def write_lod(
     """
     folder = path.parent
     folder.mkdir(parents=True, exist_ok=True)
-    path.unlink(missing_ok=True)  # first of all, as it names the others
-    for other in [*folder.glob("*_*")]:
-        if _FOLDER.fullmatch(other.name) and other.is_dir():
-            remove(other)
+    discard_levels(path)
     tree = _Tree.from_means(levels[0].means.detach().cpu().numpy())
     names: list[str] = []
     for level, splats in enumerate(levels):
@@ -94,6 +91,14 @@ def write_lod(
         "version": _VERSION, "asset": {"generator": "recon"}, "count": sum(counts),
         "counts": counts, "lodLevels": len(levels), "filenames": names,
         "tree": tree.to_json()}).encode())
+
+
+def discard_levels(path: Path) -> None:
+    """Deletes a lod-meta.json and the files of its levels, if they are there."""
+    path.unlink(missing_ok=True)  # first of all, as it names the others
+    for other in [*path.parent.glob("*_*")]:
+        if _FOLDER.fullmatch(other.name) and other.is_dir():
+            remove(other)
 
 
 def _json(value: Any) -> str:

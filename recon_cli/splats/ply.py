@@ -169,7 +169,8 @@ def load_ply(path: Path) -> LoadedScene:
     if origin is not None:
         columns["means"] = columns["means"].astype(np.float64) - origin.point
     splats = _without_sphere(splats_from_arrays(path, columns), _read_backdrop(header))
-    return LoadedScene(splats, read_up(header), is_antialiased(header), origin)
+    return LoadedScene(
+        splats, read_up(header), is_antialiased(header), origin, describe_writer(header))
 
 
 def read_up(header: Header) -> str | None:
@@ -193,6 +194,11 @@ def is_antialiased(header: Header) -> bool:
         elif words[:1] == ["antialiased"] and len(words) == 2:
             found = words[1] in ("1", "true")
     return found
+
+
+def describe_writer(header: Header) -> str:
+    """Returns the comments of a file, which name programs and settings; no backdrop's numbers."""
+    return "; ".join(text for text in header.comments if text and not _BACKDROP.fullmatch(text))
 
 
 def _read_columns(header: Header) -> dict[str, NDArray[Any]]:

@@ -13,17 +13,19 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
-from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, READ_ONLY, ExportFormat
 
 logger = logging.getLogger("recon")
 
 FORMATS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
+_READABLE: dict[str, SplatFormat] = {**FORMATS, **{
+    row.name: import_module(row.module).FORMAT for row in READ_ONLY.values()}}
 
 
 def format_of(path: Path) -> ExportFormat:
     """Returns the row of a file by the end of its name; FormatError if there is no such row."""
-    rows = [EXPORT_FORMATS[name] for name in FORMATS]
+    rows = [{**EXPORT_FORMATS, **READ_ONLY}[name] for name in _READABLE]
     found = [row for row in rows if row.fits_name(path.name)]
     if not found:
         raise FormatError(
@@ -33,7 +35,7 @@ def format_of(path: Path) -> ExportFormat:
 
 
 def read_splats(path: Path) -> Splats:
-    """Returns the Gaussians of a file in any of FORMATS where the file has them.
+    """Returns the Gaussians of a file in any format where the file has them.
 
     FormatError if it is damaged.
     """
@@ -46,7 +48,7 @@ def read_splats(path: Path) -> Splats:
 
 
 def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:
-    """Returns the scene of a file in any of FORMATS, and the statements of the file about it.
+    """Returns the scene of a file in any format, and the statements of the file about it.
 
     `axes` is a name in `axes.AXES` and wins over the axes that the file states. FormatError if it
     is damaged.
@@ -54,7 +56,7 @@ def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:
     row = format_of(path)
     if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
         raise FormatError(f"{path} is not a file.", hint="Give a file on the disk.")
-    form = FORMATS[row.name]
+    form = _READABLE[row.name]
     try:
         if axes is None:
             return form.load(path)

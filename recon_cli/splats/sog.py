@@ -146,7 +146,8 @@ def load_sog(path: Path) -> LoadedScene:
     archive = Archive(path)
     meta = archive.meta()
     antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
-    return LoadedScene(read_files(archive), antialiased=antialiased)
+    return LoadedScene(
+        read_files(archive), antialiased=antialiased, writer=archive.generator(meta))
 
 
 def read_files(archive: SogFiles) -> Splats:

@@ -101,6 +101,12 @@ class UntrustedFile:
             raise self.error("JSON that cannot be read: it is not an object")
         return value
 
+    def generator(self, json: Mapping[str, Any]) -> str:
+        """Returns the program that `asset` names, as glTF and .sog have it; empty if none."""
+        asset = json.get("asset")
+        name = asset.get("generator") if isinstance(asset, dict) else None
+        return name if isinstance(name, str) else ""
+
     def integer(
         self, part: Mapping[str, Any], name: str, least: int, most: int,
         *, default: int | None = None,

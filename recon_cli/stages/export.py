@@ -20,7 +20,7 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconError, StageError, WorkspaceError
 from recon_cli.export.bounds import describe_bounds
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
-from recon_cli.export.format_writer import FormatWriter, measure_size
+from recon_cli.export.format_writer import FormatWriter, measure_first
 from recon_cli.export.kept_files import (
     KeptFiles,
     discard_files,
@@ -74,7 +74,7 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     antialiased = not pruned and _is_antialiased(inputs.folders["train"])
     source = ExportSource(splats, inputs, frame, ctx, antialiased=antialiased)
     splats, changes = reduce_scene(
-        splats, config, source, partial(measure_size, config=config, source=source))
+        splats, config, source, partial(measure_first, config=config, source=source))
     far = describe_bounds(splats)
     if far:
         ctx.notice(far)

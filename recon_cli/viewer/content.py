@@ -16,18 +16,21 @@ from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.evaluation.reference_views import render_view
+from recon_cli.flythrough.request import TOUR_SIZE
 from recon_cli.flythrough.trained_scene import open_trained_scene
 from recon_cli.io.images import fit_camera, fit_size, read_image, read_masked_image, to_uint8
-from recon_cli.pipeline.execute import Job, render_context
+from recon_cli.pipeline.execute import Job, last_sources, render_context
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.camera_paths import visible_depths
 from recon_cli.scene.scene import View
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import leaves_enough
+from recon_cli.splats.html import find_title
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.registry import read_splats
 from recon_cli.viewer.gaussians import PackedSplats, pack_splats
+from recon_cli.viewer.keyframes import PathFolder
 
 HELD_OUT, TRAINING, VALIDATION = "held-out", "training", "validation"
 _FOLDERS = {"pruned": "prune", "base": "train"}
@@ -75,6 +78,8 @@ class ViewerContent:
     start: BrowserCamera
     distance: float  # from a camera to its target, world units
     max_size: int  # longest side that views are rendered at, in pixels
+    title: str  # of the page
+    paths: PathFolder  # where camera paths are saved
     metres: bool = False  # one world unit is a metre
 
 
@@ -97,7 +102,15 @@ def load_workspace(job: Job, model: str) -> ViewerContent:
     distance = float(np.median(depths)) if len(depths) else scene.extent
     return ViewerContent(
         models, views, trained.up(), browser_camera(first, distance, _far_plane(models)), distance,
-        trained.max_size, trained.metres)
+        trained.max_size, _find_title(job), PathFolder(
+            job.workspace.root, job.workspace.root, fit_size(first.width, first.height, TOUR_SIZE)),
+        trained.metres)
+
+
+def _find_title(job: Job) -> str:
+    """Returns the title of a capture, as that of its exported page."""
+    sources = last_sources(job, "ingest")
+    return find_title(Path(sources[0].path).name if sources else "")
 
 
 def load_file(path: Path) -> ViewerContent:
@@ -110,7 +123,9 @@ def load_file(path: Path) -> ViewerContent:
     low, high = np.array(box.low), np.array(box.high)
     middle, corner = (low + high) / 2, low + 0.8 * (high - low)
     start = BrowserCamera(corner, middle, _FOV, NEAR, _far_plane(models))
-    return ViewerContent(models, (), None, start, float(np.linalg.norm(corner - middle)), 0)
+    return ViewerContent(
+        models, (), None, start, float(np.linalg.norm(corner - middle)), 0, path.name,
+        PathFolder(Path(), None))
 
 
 def _far_plane(models: Mapping[str, PackedSplats]) -> float:

@@ -10,6 +10,7 @@ import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import rich
@@ -17,6 +18,7 @@ import viser
 
 from recon_cli.errors import ConfigError
 from recon_cli.viewer.content import PhotoPairs, ViewerContent, set_initial_camera
+from recon_cli.viewer.page import rename_page
 from recon_cli.viewer.session import UPS, Session
 from recon_cli.viewer.trust_tint import TrustTint
 from recon_cli.viewer.visitors import refusing_strangers
@@ -39,13 +41,13 @@ class Server(viser.ViserServer):
 def start_server(host: str, port: int | None, *, label: str) -> Iterator[tuple[Server, str]]:
     """Yields a running server and its address; the port is free again afterwards.
 
-    `port` None takes PORT, or the first free one after it; `label` is the title of the panel.
+    `port` None takes PORT, or the first free one after it; `label` is the title of page and panel.
     ConfigError if the port is in use, or the address is not of this machine.
     """
     chosen = _free_port(host, port)
     # viser prints to stdout; the commands inform the user
     rich.get_console().quiet = True
-    with refusing_strangers(host):
+    with refusing_strangers(host, partial(rename_page, title=label)):
         server = Server(host, chosen, label=label, verbose=False)
     try:
         if server.get_port() != chosen:  # viser moves on to the next port silently
@@ -130,7 +132,7 @@ def serve_scene(
     `start_server`.
     """
     sessions: dict[int, Session] = {}
-    with start_server(host, port, label="recon") as (server, address):
+    with start_server(host, port, label=f"{content.title} - recon") as (server, address):
         work = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recon-view")
         up = UPS["+z"] if content.up is None else content.up
         server.scene.set_up_direction(np.asarray(up, float))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ReconError
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import quaternion
 from recon_cli.viewer.content import (
     HELD_OUT,
@@ -27,6 +28,7 @@ from recon_cli.viewer.content import (
     vertical_fov,
 )
 from recon_cli.viewer.gaussians import PackedSplats, show_backdrop
+from recon_cli.viewer.keyframes import KeyframePanel
 from recon_cli.viewer.measure_panel import MeasurePanel
 from recon_cli.viewer.trust_tint import TrustTint
 
@@ -76,6 +78,7 @@ class Session:
     def leave(self) -> None:
         """Stops working for a browser that has disconnected."""
         self._gone = True
+        self._path.stop()
 
     @property
     def _packed(self) -> PackedSplats:
@@ -119,6 +122,8 @@ class Session:
         self._measure = MeasurePanel(
             self._client, lambda: self._packed.splats, self._content.distance,
             self._content.metres, self._submit)
+        self._path = KeyframePanel(
+            self._client, self._content.paths, self._content.distance, self._move_to)
         if any(packed.splats.sh_degree for packed in self._content.models.values()):
             gui.add_markdown(
                 "*Colours are as seen from where the camera last stopped: the browser does not "
@@ -259,6 +264,7 @@ class Session:
 
     def _jump_to(self, label: str) -> None:
         """Moves the camera to a view, hides the frustums and shows the view's photo."""
+        self._path.stop()
         with self._lock:
             view = self._current = self._by_label.get(label)
             if self._view.value != label:
@@ -267,10 +273,13 @@ class Session:
                 part.visible = False
             if view is not None:
                 self._cameras.value = False  # type: ignore[misc]  # has a setter
-                camera, content = view.view.camera, self._content
-                target = browser_camera(camera, content.distance, content.start.far)
-                move_browser(self._client, target, content.up, camera)
+                self._move_to(view.view.camera)
                 self._compare(view)
+
+    def _move_to(self, camera: Camera) -> None:
+        content = self._content
+        target = browser_camera(camera, content.distance, content.start.far)
+        move_browser(self._client, target, content.up, camera)
 
     def _compare(self, view: LabeledView) -> None:
         """Shows a view's photo, then recon's render of it and its score."""
@@ -291,7 +300,8 @@ class Session:
                 if (self._current, self._model) == (view, model):
                     score = "its mask leaves too little to score" if psnr_db is None else (
                         f"PSNR **{psnr_db:.2f} dB**")
-                    self._score.content = f"{view.label}, {model}: {score}"
+                    self._score.content = (
+                        f"{view.label}, {MODEL_LABELS.get(model, model)}: {score}")
                     self._ours.image = image
                     self._ours.visible = self._score.visible = True
 

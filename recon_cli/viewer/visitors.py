@@ -21,6 +21,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 _Answer = Callable[[ServerConnection, Request], Response | None]
+_Change = Callable[[Response | None], Response | None]
 
 
 def find_refusal(host: str, hosts: list[str], origins: list[str]) -> str:
@@ -50,10 +51,11 @@ def _is_own(name: str, host: str) -> bool:
 
 
 @contextmanager
-def refusing_strangers(host: str) -> Iterator[None]:
+def refusing_strangers(host: str, change: _Change = lambda response: response) -> Iterator[None]:
     """Has the server of viser that starts in the block refuse strangers.
 
-    viser leaves no other way than the function by which it serves.
+    `change` gets its answers to others. viser leaves no other way than the function by which it
+    serves.
 
     Raises:
         RuntimeError: it no longer serves by that; it must not run without.
@@ -62,7 +64,8 @@ def refusing_strangers(host: str) -> Iterator[None]:
 
     def serve(*arguments: Any, process_request: _Answer, **options: Any) -> Any:
         served.append(True)
-        return plain(*arguments, process_request=partial(_answer, host, process_request), **options)
+        return plain(*arguments, process_request=partial(
+            _answer, host, change, process_request), **options)
 
     websocket_server.serve = serve  # type: ignore[assignment, misc]
     try:
@@ -74,10 +77,10 @@ def refusing_strangers(host: str) -> Iterator[None]:
 
 
 def _answer(
-    host: str, answer: _Answer, connection: ServerConnection, request: Request
+    host: str, change: _Change, answer: _Answer, connection: ServerConnection, request: Request
 ) -> Response | None:
     refusal = find_refusal(
         host, request.headers.get_all("Host"), request.headers.get_all("Origin"))
     if refusal:
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"{refusal}\n")
-    return answer(connection, request)
+    return change(answer(connection, request))

@@ -2,7 +2,8 @@
 
 It lies this low because options, freshness and the stage all read it. A new format of Gaussians
 needs a row, and the module that the row names: its `FORMAT` writes and reads the files
-(`splats.registry`). Points, cameras, meshes and plans are written by `export.format_writer`.
+(`splats.registry`). One that is only read has its row in a table of its own. Points, cameras,
+meshes and plans are written by `export.format_writer`.
 """
 
 from __future__ import annotations
@@ -81,6 +82,12 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("mesh.glb", "mesh", "mesh.glb", options=_MESH_OPTIONS),
     ExportFormat("mesh.obj", "mesh", "mesh.obj", options=_MESH_OPTIONS),
     ExportFormat(PLAN, "plan", PLAN, more_files=("measures.json",), options=_MESH_OPTIONS),
+)}
+
+# Formats that are read, but not written.
+READ_ONLY: dict[str, ExportFormat] = {row.name: row for row in (
+    ExportFormat("ksplat", "gaussians", "splats.ksplat", "recon_cli.splats.ksplat"),
+    ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad"),
 )}
 
 

@@ -77,7 +77,8 @@ class ExportedFile(JsonRecord):
     """A file or folder beside the exported .ply."""
 
     file: str  # name
-    bytes: int | None = None  # None, as the next two, for cameras and points
+    bytes: int | None = None  # None for a folder of cameras
+    # None, as the next one, for what is not of Gaussians
     smaller: float | None = None  # size of the .ply over its size
     psnr_change_db: float | None = None  # on the views that the export is checked on
     # sources: version, model, digests of stages, options; None where an older version wrote it

@@ -81,15 +81,30 @@ class Workspace:
         Raises:
             WorkspaceError: another process holds it, or it cannot be made.
         """
+        is_new = not os.path.lexists(self.root)
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise WorkspaceError(
                 f"The workspace {self.root} cannot be made: {error.strerror}.",
                 hint="Give another folder with -w.") from error
-        with hold_lock(self.root, verb):
-            self.recover()
-            yield
+        try:
+            with hold_lock(self.root, verb):
+                self.recover()
+                yield
+        except ReconError:
+            if is_new:
+                self._remove_if_empty()
+            raise
+
+    def _remove_if_empty(self) -> None:
+        """Removes a folder that a failed first command made, unless there is work in it."""
+        if not {path.name for path in self.root.iterdir()} <= {LOG, LOCK, HOLDER}:
+            return
+        for name in (LOG, LOCK, HOLDER):
+            (self.root / name).unlink(missing_ok=True)
+        with suppress(OSError):  # somebody has put a file there meanwhile
+            self.root.rmdir()
 
     def manifest(self, stage: str) -> Manifest | None:
         """Returns the manifest of a stage's result, or None where there is none.

@@ -170,7 +170,7 @@ def owned(verb: str, words: Sequence[str] = ()) -> set[str]:
     stages = {
         "ingest": {"ingest"}, "denoise": {"denoise"}, "sfm": {"denoise", "sfm"},
         "train": {"denoise", "sfm", "train"}, "import": {"train"}, "prune": {"prune"},
-        "eval": {"evaluate"}, "export": {"export"}, "run": set(STAGES),
+        "eval": {"evaluate"}, "export": {"export"}, "run": {*STAGES, "report.html"},
         "render": {"render"}, "report": {"report.html"}, "status": set(), "batch": set(STAGES),
         "clean": {"sfm", "blocks", "seeds", *words}}[verb]
     return stages | ({"prune"} if "--prune" in words else set())

@@ -43,7 +43,8 @@ def _set_up(case: Case, verb: str) -> tuple[Path, tuple[str, ...], Path, set[str
         workspace = case.folder / "ws"
         workspace.mkdir()
         (workspace / "recon.toml").write_bytes((lab.tiny / "recon.toml").read_bytes())
-        words = ("run", str(lab.clip), "--set", "prune.at=end", "-w", str(workspace))
+        words = ("run", str(lab.clip), "--set", "prune.at=end", "--format", "ply", "-w",
+                 str(workspace))
         return workspace, words, lab.tiny, set(STAGES)
     if verb == "train --prune":
         workspace = case.workspace(without=("train", "prune"))

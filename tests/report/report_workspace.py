@@ -22,6 +22,7 @@ from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import STAGES, evaluate, export, prune, train
 from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.manifest import Manifest
 
 TABLE = tuple(replace(row, module="report_workspace", renders=False) for row in STAGES)
 RUN = {"iterations": 60, "max_gaussians": 120, "sh_rate": 0.05, "densify_every": 10,
@@ -96,6 +97,13 @@ def change(path: Path, edit) -> None:
     value = json.loads(path.read_text())
     edit(value)
     path.write_text(json.dumps(value))
+
+
+def give_title(workspace: Path, title: str) -> None:
+    """Makes the export one that was given a title."""
+    manifest = Manifest.read(workspace / "export")
+    key = replace(manifest.key, config={**manifest.key.config, "title": title})
+    replace(manifest, key=key).write(workspace / "export")
 
 
 def paint(workspace: Path, *, truth: int, render: int) -> None:

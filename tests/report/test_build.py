@@ -103,8 +103,8 @@ def test_no_section_shows_figures_of_a_stale_stage_without_saying_so(workspace):
         assert STALE in section(page, name)
     assert "training (stale)" in section(page, "training")
     head = page[:page.index('role="tablist"')]
-    # Gaussians, PSNR, SSIM and the time of training; frames and cameras are fresh
-    assert head.count('class="tag">stale') == 4
+    # the word, PSNR, the well seen share, Gaussians and time; cameras are fresh
+    assert head.count('class="tag">stale') == 5
     assert "train.iterations changed: 60 -&gt; 7" in page
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import summaries
 
+from recon_cli.evaluation.scores import ViewScore
 from recon_cli.report.headline import format_facts, judge_poses
 from recon_cli.report.stage_status import StageReport
 from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord
@@ -74,3 +75,11 @@ def test_a_fact_has_its_unit(name, value, expected):
 
 def test_lists_and_what_is_empty_are_no_format_facts():
     assert format_facts({"a": [], "b": {}, "c": None, "d": "", "cuda_peak_bytes": 0}) == ()
+
+
+def test_poses_are_not_praised_above_a_view_that_failed():
+    failed = ViewScore("000007.png", 18.04, 18.0, 0.5, 0.5)
+    verdict = judge_poses(sfm(verdict={"trusted": True}, lines=["head"]), [failed])
+    assert verdict.level == "warn"
+    assert "can be trusted" not in verdict.text
+    assert "000007.png failed (18.0 dB)" in verdict.text

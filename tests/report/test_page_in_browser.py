@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from browser import WatchedPage
-from report_workspace import change, paint, report
+from report_workspace import change, give_title, paint, report
 
 from recon_cli.io.images import write_png
 
-SECTIONS = ("overview", "views", "scores", "training", "pruning", "capture", "exports", "settings")
+SECTIONS = ("views", "overview", "scores", "training", "pruning", "capture", "exports", "settings")
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_tabs_are_reached_by_keys_and_by_address(workspace, page):
     assert page.page.locator("#training").is_visible()
     page.page.focus("#tab-training")
     for key, name in (("ArrowRight", "pruning"), ("ArrowLeft", "training"), ("End", "settings"),
-                      ("ArrowRight", "overview"), ("ArrowLeft", "settings"), ("Home", "overview")):
+                      ("ArrowRight", "views"), ("ArrowLeft", "settings"), ("Home", "views")):
         page.page.keyboard.press(key)
         assert page.page.locator(f"#{name}").is_visible()
         assert page.page.evaluate("document.activeElement.id") == f"tab-{name}"
@@ -149,7 +149,7 @@ def test_models_have_renders_of_their_own(workspace, page):
     assert fraction_dark(page) == pytest.approx(0.5, abs=0.03)
     page.page.keyboard.press("m")
     assert fraction_dark(page) < 0.03
-    assert page.page.locator("#side").inner_text() == "render, pruned"
+    assert page.page.locator("#side").inner_text() == "render, compact"
 
 
 def test_views_are_turned_by_keys_buttons_and_clicks(shown, workspace):
@@ -204,6 +204,7 @@ def test_hostile_names_are_harmless(workspace, page):
     change(workspace / "train" / "plan.json", lambda value: value.update(
         needs=[{"name": HARM, "on": True, "reason": SCRIPT}]))
     change(workspace / "train" / "config.json", lambda value: value.update(images=HARM))
+    give_title(workspace, HARM)
     hostile = workspace.rename(workspace.with_name(f"'\"&{HARM}"))
     opened(hostile, page)
     for name in SECTIONS:
@@ -211,7 +212,7 @@ def test_hostile_names_are_harmless(workspace, page):
     assert page.page.evaluate("typeof hacked") == "undefined"
     assert page.page.locator("img[src=x]").count() == 0
     assert page.page.locator("script").count() == 2  # the data and the page's own
-    assert page.page.inner_text("h1") == f"'\"&{HARM}"
+    assert page.page.inner_text("h1") == HARM
     page.page.click("#tab-views")
     assert f"{SCRIPT}.png" in names(page)
     page.assert_silent()
@@ -235,6 +236,19 @@ def test_nothing_sticks_out_of_the_window(shown, width):
     for name in SECTIONS:
         shown.page.click(f"#tab-{name}")
         assert shown.page.evaluate("document.documentElement.scrollWidth") <= width, name
+
+
+def test_a_phone_cuts_no_table_and_begins_at_the_top(shown):
+    shown.page.set_viewport_size({"width": 390, "height": 844})
+    shown.page.reload()
+    assert shown.page.evaluate("window.scrollY") == 0
+    assert shown.page.locator(".room img").bounding_box()["width"] > 340
+    for name in SECTIONS:
+        shown.page.click(f"#tab-{name}")
+        cut = shown.page.evaluate(
+            "[...document.querySelectorAll('.scroll')].filter(box => "
+            "box.scrollWidth > box.clientWidth + 1 && !box.querySelector('.sheet')).length")
+        assert cut == 0, name
 
 
 def test_it_follows_light_and_dark(shown):

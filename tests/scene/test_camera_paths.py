@@ -6,7 +6,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.camera import looking_at
-from recon_cli.scene.camera_paths import orbit_path, smooth_path
+from recon_cli.scene.camera_paths import keyframe_path, orbit_path, smooth_path
 
 pytestmark = pytest.mark.floors
 
@@ -144,3 +144,28 @@ def test_one_frame_is_the_start_of_the_path():
     found = smooth_path(circle(24), 1)
     assert found.shape == (1, 4, 4)
     assert np.linalg.norm(centers(found)[0] - centers(circle(24))[0]) < 0.3
+
+
+def test_a_path_through_keyframes_passes_each_and_keeps_its_speed():
+    places = np.array([[0.0, 0, 0], [4, 0, 0], [4, 1, 0], [0, 1, 1]])
+    rotations = Rotation.from_rotvec(np.radians([0, 60, 90, 200])[:, None] * UP)
+    keys, fovs = placed(places, rotations), np.array([50.0, 60.0, 40.0, 50.0])
+    path, wide = keyframe_path(keys, fovs, 2001)
+    found = centers(path)
+    for place, fov, key in zip(places, fovs, keys, strict=True):
+        at = int(np.linalg.norm(found - place, axis=1).argmin())
+        np.testing.assert_allclose(found[at], place, atol=5e-3)
+        assert wide[at] == pytest.approx(fov, abs=0.1)
+        assert turns(np.stack([path[at], key]))[0] < 0.3
+    steps = np.linalg.norm(np.diff(found, axis=0), axis=1)
+    assert steps.max() < 1.05 * np.median(steps)
+    bends = np.linalg.norm(np.diff(found, 2, axis=0), axis=1)  # no corner anywhere
+    assert bends.max() < 0.05 * np.median(steps)
+    assert found.max() < 4.5  # and no wide swing beyond the keyframes
+    np.testing.assert_allclose(path[[0, -1]], keys[[0, -1]], atol=1e-9)
+
+
+def test_two_keyframes_that_differ_by_a_turn_alone_make_a_path():
+    keys = placed(np.zeros((2, 3)), Rotation.from_rotvec(np.radians([0, 90])[:, None] * UP))
+    path, _ = keyframe_path(keys, np.array([50.0, 50.0]), 91)
+    np.testing.assert_allclose(turns(path), 1.0, atol=0.02)

@@ -19,7 +19,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.splats.axes import turn_from
 from recon_cli.splats.format import Tour
-from recon_cli.splats.html import PageStyle, _find_title, default_view, read_html, write_html
+from recon_cli.splats.html import PageStyle, default_view, find_title, read_html, write_html
 from recon_cli.splats.spz import load_spz, spz_bytes
 
 Y_DOWN = np.array([0.0, -1, 0])
@@ -303,4 +303,4 @@ def test_a_tour_is_told_place_by_place(tmp_path):
     ("PXL_20260314_101500123.mp4", "A place in 3D"), ("DSC00042.JPG", "A place in 3D"),
 ])
 def test_a_title_is_made_of_a_name_that_somebody_gave(name, title):
-    assert _find_title(name) == title
+    assert find_title(name) == title

@@ -38,5 +38,5 @@ def test_a_file_under_the_name_of_another_format_is_refused(name, tmp_path):
 
 def test_an_unknown_ending_is_refused_with_those_that_are_known(tmp_path):
     with pytest.raises(FormatError, match="known format") as caught:
-        read_splats(tmp_path / "room.ksplat")
+        read_splats(tmp_path / "room.xyz")
     assert ".spz" in caught.value.hint

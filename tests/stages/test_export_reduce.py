@@ -137,7 +137,7 @@ def test_the_size_is_met_by_what_looks_best(whole):
     best = fit_to_size(
         whole, 68 * 40 + 2000, size_of=lambda splats: len(splats) * (
             68 + 12 * (0, 3, 8, 15)[splats.sh_degree]) + 1500,
-        score_of=lambda splats: torch.arange(len(splats)).double(),
+        fewer=lambda splats, count: splats.select(torch.arange(len(splats) - count, len(splats))),
         at_degree=whole.with_degree, psnr_db=psnr_db)
     assert best.sh_degree == 1
     assert [degree for degree, _ in asked] == [3, 2, 1, 0]

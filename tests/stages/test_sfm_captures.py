@@ -40,7 +40,7 @@ def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
     assert summary.models == (10, 6)
     # No match ties the two together, so that no further way is worth trying.
     assert [attempt.name for attempt in summary.attempts] == ["exhaustive"]
-    assert_facts(caplog.text, "disconnected models", 10, "used")
+    assert_facts(caplog.text, "disconnected models", "6 frames", "used")
     assert "living000000.png" in caplog.text
 
 
@@ -106,7 +106,7 @@ def test_the_frames_of_every_way_of_pairing_meet(sample_video, tmp_path):
                       pairs=pairs)
         assert summary.registered == 8
         attempt, = summary.attempts
-        assert (attempt.name, attempt.reason, attempt.kept) == (pairs, "it was asked for", True)
+        assert (attempt.name, attempt.reason, attempt.kept) == (pairs, "--pairs asks for it", True)
 
 
 def test_from_clip_to_clip_the_camera_may_be_anywhere(tmp_path):

@@ -11,6 +11,7 @@ from viewing import complaints, nodes, opened, until, view
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image, to_uint8
 from recon_cli.render import render
+from recon_cli.splats.html import ICON
 from recon_cli.viewer.content import TRAINING
 from recon_cli.viewer.measure import locate_click
 from recon_cli.viewer.session import Session
@@ -59,6 +60,24 @@ def test_the_page_draws_what_recon_renders_and_asks_nobody_else(shown, page, els
                for address in page.addresses)
 
 
+def test_the_page_has_a_name_and_icon_of_its_own(shown, page):
+    opened(page, shown)
+    assert page.page.title() == f"{shown.content.title} - recon"
+    icon = page.page.evaluate("document.querySelector('link[rel=icon]').href")
+    assert icon == ICON
+    assert not complaints(page)
+
+
+def test_on_a_phone_the_panel_is_folded_until_it_is_wanted(shown, page):
+    page.page.set_viewport_size({"width": 390, "height": 844})
+    page.page.goto(shown.address)
+    head = page.page.get_by_text(f"{shown.content.title} - recon", exact=True)
+    head.wait_for(timeout=60_000)
+    until(page, lambda: head.bounding_box()["y"] > 780)  # the picture above is free
+    head.click()
+    until(page, lambda: head.bounding_box()["y"] < 600)
+
+
 def test_a_jump_puts_the_camera_where_the_view_is_and_shows_its_photo_and_score(shown, page):
     client = opened(page, shown)
     page.page.get_by_text("next", exact=True).click()
@@ -66,7 +85,7 @@ def test_a_jump_puts_the_camera_where_the_view_is_and_shows_its_photo_and_score(
     view = shown.content.views[0].view
     assert view.name == "000000.png"
     text = page.page.inner_text("body")
-    assert "000000.png (held-out), pruned: PSNR" in text
+    assert "000000.png (held-out), compact: PSNR" in text
     with torch.no_grad():
         splats = shown.content.models["pruned"].splats
         ours = render(splats, view.camera, splats.background, 3).rgb.numpy()
@@ -80,7 +99,7 @@ def test_a_jump_puts_the_camera_where_the_view_is_and_shows_its_photo_and_score(
     photos = page.page.locator("img:visible")
     assert [photo.evaluate("image => image.naturalWidth") for photo in photos.all()] == [48, 48]
     page.page.get_by_text("previous", exact=True).click()
-    page.page.get_by_text(f"{shown.content.views[-1].label}, pruned").wait_for(timeout=60_000)
+    page.page.get_by_text(f"{shown.content.views[-1].label}, compact").wait_for(timeout=60_000)
 
 
 def test_the_cameras_come_with_their_photos_when_they_are_asked_for(shown, page):

@@ -18,8 +18,8 @@ from recon_cli.viewer.trust_tint import TrustTint
 from recon_cli.workspace.layout import Workspace
 
 T = TypeVar("T")
-# What the page's own libraries say of themselves; nothing of it is ours to mend.
-FOREIGN = ("THREE.Clock: This module has been deprecated", "computeBoundingSphere()")
+# A warning of the page's own libraries about themselves.
+FOREIGN = ("THREE.Clock: This module has been deprecated",)
 PATIENCE = 60  # seconds; a browser without a GPU on a busy machine is slow
 
 

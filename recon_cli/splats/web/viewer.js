@@ -193,7 +193,8 @@ function along(seconds) {
   return {
     position: new THREE.Vector3(curve("x"), curve("y"), curve("z")),
     rotation: a.rotation.clone().slerp(b.rotation, t), distance: mix(a.distance, b.distance),
-    margins: a.margins.map((_, k) => mix(a.margins[k], b.margins[k])), lens: a.lens };
+    margins: a.margins.map((_, k) => mix(a.margins[k], b.margins[k])),
+    lens: (t < 0.5 ? a : b).lens };
 }
 
 function setPlaying(value) {

@@ -1,0 +1,139 @@
+"""`recon run --minutes M`: a time for the whole run, spent by how fast this machine is.
+
+Frames are chosen so that finding their cameras takes a fixed share of the time; training takes as
+long as then is left beside pruning and scores; pruning is left out where there is no time for it.
+The choices are recorded, so that the same command continues a run and finds a finished one fresh.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon_cli import machine
+from recon_cli.commands.jobs import open_job, run_stages
+from recon_cli.commands.options import Call
+from recon_cli.config.settings import Settings, merge
+from recon_cli.errors import ReconError
+from recon_cli.sfm.time_estimate import Workload, expected_seconds, measure_slowness
+from recon_cli.workspace.atomic import read_json, write_json
+from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.summaries import IngestSummary, JsonRecord, TrainSummary
+
+FILE = "budget.json"
+LEAST_FRAMES = 24
+_SFM = 0.4  # of the time, at most
+# Pruning midway continues with half of the Gaussians through the last two fifths of the steps.
+_PRUNE = 0.45  # of the seconds of training
+_SCORES = 20.0  # seconds of evaluate, export and report, on the machine of sfm.time_estimate
+_LEAST_TRAINING = 12.0  # seconds, likewise
+
+logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget(JsonRecord):
+    """What was chosen for a number of minutes; None: not yet."""
+
+    minutes: float
+    inputs: tuple[str, ...]  # absolute paths
+    frames: int | None = None  # that ingest chooses; None: as many as without a budget
+    train_minutes: float | None = None
+    prune: bool | None = None
+
+
+def run_within(
+    call: Call, minutes: float, inputs: tuple[Path, ...], base: Settings, *, with_prune: bool
+) -> None:
+    """Runs every stage in about so many minutes, and says what is given up for it."""
+    began = time.monotonic()
+    workspace = Workspace(call.workspace)
+    budget = _recorded(call, minutes, inputs) or Budget(
+        minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs))
+    threads = open_job(call).compute.threads or machine.usable_threads()
+    slowness = measure_slowness(threads)
+
+    def left() -> float:
+        return 60 * minutes - (time.monotonic() - began)
+
+    def stages(*names: str, **chosen: Settings) -> None:
+        run_stages(call, "run", names, sources=inputs if "ingest" in names else (), base=merge(
+            [base, *chosen.values()]))
+
+    frames: Settings = {} if budget.frames is None else {"ingest": {"frames": budget.frames}}
+    stages("ingest", frames=frames)
+    if budget.train_minutes is None:
+        fewer = _fewer_frames(call, workspace, _SFM * 60 * minutes, threads, slowness)
+        if fewer is not None:
+            budget = dataclasses.replace(budget, frames=fewer)
+            frames = {"ingest": {"frames": fewer}}
+            stages("ingest", frames=frames)
+    stages("denoise", "sfm", frames=frames)
+    if budget.train_minutes is None:
+        rest = left() - _SCORES * slowness
+        seconds = max(rest / (1 + _PRUNE) if with_prune else rest, _LEAST_TRAINING * slowness)
+        budget = dataclasses.replace(budget, train_minutes=round(seconds / 60, 2))
+        write_json(workspace.root / FILE, budget.to_json())
+    training: Settings = {"train": {"minutes": budget.train_minutes}}
+    stages("train", frames=frames, training=training)
+    if budget.prune is None:
+        budget = dataclasses.replace(budget, prune=with_prune and _has_time_to_prune(
+            workspace, left() - _SCORES * slowness))
+        write_json(workspace.root / FILE, budget.to_json())
+        if with_prune and not budget.prune:
+            logger.warning("there is no time to prune in %g minutes: the scene keeps all its "
+                           "Gaussians; `recon prune` removes some", minutes)
+    stages(*["prune"] * bool(budget.prune), "evaluate", "export", frames=frames, training=training)
+    taken = time.monotonic() - began
+    if taken > 1.2 * 60 * minutes:
+        logger.warning("the run took %.1f minutes, more than the %g of --minutes: the smallest "
+                       "training takes that long here", taken / 60, minutes)
+
+
+def _recorded(call: Call, minutes: float, inputs: tuple[Path, ...]) -> Budget | None:
+    """Returns the choices of an earlier run for the same minutes and inputs."""
+    path = call.workspace / FILE
+    if call.again or not path.is_file():
+        return None
+    try:
+        found = Budget.from_json(read_json(path, dict))
+    except ReconError:
+        return None
+    same = not inputs or found.inputs == tuple(str(item.absolute()) for item in inputs)
+    return found if same and found.minutes == minutes else None
+
+
+def _fewer_frames(
+    call: Call, workspace: Workspace, seconds: float, threads: int, slowness: float
+) -> int | None:
+    """Returns to how many frames a capture is cut for cameras in time; None: it stays."""
+    manifest = workspace.manifest("ingest")
+    assert manifest is not None
+    ingested = IngestSummary.from_json(manifest.run.summary)
+    if call.settings.get("ingest", {}).get("frames") is not None or ingested.metric is not None:
+        return None  # asked for, or its cameras are known
+    megapixels = ingested.width * ingested.height / 1e6
+
+    def estimate(frames: int) -> float:
+        return expected_seconds(
+            Workload(frames, megapixels, ingested.kind == "video"), threads, slowness=slowness)
+
+    frames = ingested.frames
+    if estimate(frames) <= seconds:
+        return None
+    while frames > LEAST_FRAMES and estimate(frames) > seconds:
+        frames = max(LEAST_FRAMES, int(0.95 * frames))
+    logger.warning(
+        "%d of %d frames are used, so that the run ends within --minutes; --frames keeps more",
+        frames, ingested.frames)
+    return frames
+
+
+def _has_time_to_prune(workspace: Workspace, left: float) -> bool:
+    manifest = workspace.manifest("train")
+    assert manifest is not None
+    training = TrainSummary.from_json(manifest.run.summary)
+    return bool(training.gaussians) and left > 0.6 * _PRUNE * manifest.run.seconds

@@ -1,0 +1,81 @@
+"""The end of a run: what was made, where it lies, how good it is, and what to type next."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from recon_cli.commands.jobs import open_job
+from recon_cli.commands.options import Call, explicit_settings
+from recon_cli.errors import ReconstructionError
+from recon_cli.progress import format_megabytes
+from recon_cli.workspace.export_record import ExportSummary
+from recon_cli.workspace.layout import Workspace
+from recon_cli.workspace.records import read_frame_list
+from recon_cli.workspace.summaries import SfmSummary
+
+logger = logging.getLogger("recon")
+
+
+def end_run(call: Call, *, open_page: bool = False) -> None:
+    """Writes the report, and prints the results of a run that is complete."""
+    from recon_cli.report.build import FILE, write_report
+    from recon_cli.trust.quality import read_quality
+
+    job = open_job(call)
+    folder = job.workspace.folder("export")
+    manifest = job.workspace.manifest("export")
+    assert manifest is not None, "the run has exported"
+    export = ExportSummary.from_json(manifest.run.summary)
+    write_report(job, None)
+    report = job.workspace.root / FILE
+    html = (export.files or {}).get("html")
+    page = folder / html.file if html is not None and not html.stale else None
+    click.echo("")
+    for name, path in (("scene", folder / export.file), ("page", page), ("report", report)):
+        if path is not None:
+            click.echo(f"{name + ':':9}{path} ({format_megabytes(path.stat().st_size)})")
+    sfm = job.workspace.manifest("sfm")
+    quality = read_quality(
+        job.workspace.folder("evaluate"), SfmSummary.from_json(sfm.run.summary) if sfm else None,
+        read_frame_list(job.workspace.folder("ingest")).frames)
+    click.echo(f"quality: {quality}")
+    click.echo(f"next:    {_next_command(call.workspace, page)}")
+    if open_page:
+        webbrowser.open((page or report).resolve().as_uri())
+
+
+@contextmanager
+def optional_page(call: Call) -> Iterator[None]:
+    """Makes a notice of a page that could not be written, where nobody asked for it by name."""
+    try:
+        yield
+    except ReconstructionError as error:
+        manifest = Workspace(call.workspace).manifest("export")
+        failure = manifest and ExportSummary.from_json(manifest.run.summary).failure()
+        asked = any("format" in settings.get("export", {})
+                    for settings in (call.settings, explicit_settings(call)))
+        if asked or not failure or failure.message != error.message:
+            raise
+        logger.warning("there is no page: %s", error.message)
+
+
+def _next_command(workspace: Path, page: Path | None) -> str:
+    """Returns what to do with the results."""
+    if page is None:
+        return name_workspace("recon view", workspace)
+    return (f"open {page.name} in a browser or send it; "
+            f"{name_workspace('recon render --tour --out walk.mp4', workspace)}")
+
+
+def name_workspace(command: str, workspace: Path) -> str:
+    """Returns a command with the workspace, unless it is the one that is taken without -w."""
+    usual = Path(os.environ.get("RECON_WORKSPACE") or "workspace")
+    return command if workspace == usual else f"{command} -w {shlex.quote(str(workspace))}"

@@ -1,0 +1,195 @@
+"""Facts about a splat file: what it holds, how it renders, and what is wrong with it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon_cli.context import StageContext
+from recon_cli.errors import FormatError
+from recon_cli.export.bounds import find_bulk
+from recon_cli.export.synthetic_cameras import synthetic_scene
+from recon_cli.render import render
+from recon_cli.scene.splats import Splats
+from recon_cli.splats.axes import UP
+from recon_cli.splats.foreign import FLAT
+from recon_cli.splats.format import LoadedScene
+from recon_cli.splats.registry import format_of, load_splats
+
+_VIEW_SIZE = 600  # pixels, longest side of the renders that overdraw is counted in
+_VISIBLE = 0.5 / 255  # coverage that changes an 8-bit image
+_TINY = 5e-4  # of the radius: half a pixel in an image 1000 pixels wide, taken from that far
+_HUGE = 0.1  # of the radius, or of the distance from the middle
+_FAINT = 0.05  # opacity of nearly transparent ones
+_BULK = 0.9  # of the Gaussians lie within the radius
+_FAR = 100.0  # radii from the origin
+_WIDE = 10.0  # times the bulk: viewers that fit all start far away
+_UNIT = 0.01  # by which the length of a quaternion may differ from 1
+_MANY = 0.5  # share that is worth a word
+
+logger = logging.getLogger("recon")
+Corner = list[float]
+
+
+@dataclass(frozen=True)
+class FileFindings:
+    """The facts that `recon info --json` prints under these names; lengths are in units."""
+
+    file: str
+    format: str
+    bytes: int
+    gaussians: int
+    sh_degree: int
+    up: str | None  # z, -y or y as the file says; None if it does not
+    writer: str  # what the file says of its writer; empty if nothing
+    antialiased: bool  # the file says that it was trained with antialiasing
+    backdrop: bool  # one colour is behind all
+    bounds: tuple[Corner, Corner]  # of all centres
+    bulk_bounds: tuple[Corner, Corner]  # nine tenths of the centres along each axis
+    median_size: float  # greatest standard deviation of the median Gaussian
+    tiny: float  # shares of all Gaussians, 0 to 1
+    huge: float
+    nearly_transparent: float
+    overdraw: float | None  # Gaussians a covered pixel, on the mean; None if no camera sees any
+    problems: tuple[str, ...]
+
+    def describe(self) -> str:
+        """Returns the facts, one line each."""
+        rows = {
+            "": self.file,
+            "format": f"{self.format}, {self.bytes / 1e6:.2f} MB",
+            "Gaussians": f"{self.gaussians:,}, degree {self.sh_degree}"
+            + (", and a backdrop" if self.backdrop else ""),
+            "up": self.up or "not stated",
+            "writer": self.writer or "not stated",
+            "bounds": _box(self.bounds),
+            "nine tenths": _box(self.bulk_bounds),
+            "size": f"{self.median_size:.3g} (median); {self.tiny:.1%} tiny, {self.huge:.1%} huge",
+            "opacity": f"{self.nearly_transparent:.1%} nearly transparent",
+            "overdraw": "unknown" if self.overdraw is None else (
+                f"{self.overdraw:.1f} Gaussians a pixel"),
+        }
+        lines = [f"{name:<12} {text}".strip() for name, text in rows.items()]
+        if self.antialiased:
+            lines.append(f"{'rendering':<12} trained with antialiasing (Mip-Splatting)")
+        return "\n".join(lines + [f"{'problem':<12} {text}" for text in self.problems])
+
+
+def describe_file(path: Path, ctx: StageContext) -> FileFindings:
+    """Returns the facts about a file; FormatError if it is damaged, empty or unknown."""
+    with _collected_warnings() as problems:
+        scene = load_splats(path)
+    splats = scene.splats
+    if not len(splats):
+        raise FormatError(f"{path} holds no Gaussians.", hint="Export it again.")
+    means = splats.means.double()
+    away = (means - means.median(dim=0).values).norm(dim=1)
+    radius = float(away.sort().values[round(_BULK * (len(away) - 1))])
+    size = splats.scales.amax(dim=1)
+    low, high = find_bulk(means)
+    overdraw = _measure_overdraw(splats, np.array(UP[scene.up or "-y"]), ctx)
+    shift = torch.tensor(
+        scene.origin.point if scene.origin else (0.0, 0.0, 0.0), dtype=torch.float64)
+    problems += _find_problems(scene, radius, (low, high), overdraw)
+    return FileFindings(
+        file=str(path), format=format_of(path).name, bytes=path.stat().st_size,
+        gaussians=len(splats), sh_degree=splats.sh_degree, up=scene.up,
+        writer=_printable(scene.writer), antialiased=scene.antialiased,
+        backdrop=splats.backdrop is not None,
+        bounds=_corners(means.amin(dim=0) + shift, means.amax(dim=0) + shift),
+        bulk_bounds=_corners(low + shift, high + shift),
+        median_size=float(size.median()), tiny=_share(size < _TINY * radius),
+        huge=_share(size > _HUGE * away.clamp_min(radius)),
+        nearly_transparent=_share(splats.opacities < _FAINT), overdraw=overdraw,
+        problems=tuple(_printable(text) for text in problems))
+
+
+@contextmanager
+def _collected_warnings() -> Iterator[list[str]]:
+    """Yields a list that takes the warnings of the block instead of the log."""
+    texts: list[str] = []
+
+    def take(record: logging.LogRecord) -> bool:
+        if record.levelno < logging.WARNING:
+            return True
+        texts.append(record.getMessage())
+        return False
+
+    logger.addFilter(take)
+    try:
+        yield texts
+    finally:
+        logger.removeFilter(take)
+
+
+def _find_problems(
+    scene: LoadedScene, radius: float, bulk: tuple[Tensor, Tensor], overdraw: float | None
+) -> list[str]:
+    """Returns one line about each thing that makes trouble in viewers, beside those on reading."""
+    splats, found, count = scene.splats, list[str](), f"{len(scene.splats):,}"
+    means, lengths = splats.means.double(), splats.quats.double().norm(dim=1)
+    flat = int((splats.log_scales <= FLAT + 1e-3).any(dim=1).sum())
+    if flat:
+        found.append(f"{flat:,} of {count} Gaussians have a scale of 0")
+    none, other = int((lengths == 0).sum()), int(((lengths - 1).abs() > _UNIT).sum())
+    if none:
+        found.append(f"{none:,} of {count} rotations are 0 0 0 0, which some viewers do not draw")
+    if other > none:
+        found.append(f"{other - none:,} of {count} quaternions are not of length 1, which most "
+                     "viewers mend")
+    if scene.origin is not None:
+        found.append(scene.origin.describe())
+    middle = float(means.median(dim=0).values.norm())
+    if scene.origin is None and radius and middle > _FAR * radius:
+        found.append(f"everything is far away: {middle:.4g} units from the origin, where the scene "
+                     f"has a radius of {radius:.4g}; viewers that turn about the origin miss it")
+    across = float((means.amax(dim=0) - means.amin(dim=0)).max())
+    if across > _WIDE * float((bulk[1] - bulk[0]).max()) > 0:
+        found.append(f"it is {across:.4g} units across, but nine tenths of the Gaussians lie in a "
+                     "small part of that: viewers that fit all start far away")
+    if _share(splats.opacities < _FAINT) > _MANY:
+        found.append("most Gaussians are nearly transparent")
+    if overdraw is None:
+        found.append("no camera around the scene or in it sees anything")
+    return found
+
+
+def _measure_overdraw(
+    splats: Splats, up: NDArray[np.float64], ctx: StageContext
+) -> float | None:
+    """Returns how many Gaussians contribute to a covered pixel of synthetic views, on the mean."""
+    on_device = splats.map(lambda tensor: tensor.to(ctx.device))
+    hits = pixels = 0
+    for view in synthetic_scene(splats, up=up, max_size=_VIEW_SIZE).train:
+        with torch.no_grad():
+            output = render(on_device, view.camera, on_device.background, 0, backend=ctx.backend,
+                            scores=True)
+        hits += int(output.statistics.hits.sum())
+        pixels += int((output.alpha > _VISIBLE).sum())
+    return hits / pixels if pixels else None
+
+
+def _share(mask: Tensor) -> float:
+    return float(mask.double().mean())
+
+
+def _corners(low: Tensor, high: Tensor) -> tuple[Corner, Corner]:
+    return low.tolist(), high.tolist()
+
+
+def _box(corners: tuple[Corner, Corner]) -> str:
+    low, high = (" ".join(f"{value:.4g}" for value in corner) for corner in corners)
+    return f"{low} to {high}"
+
+
+def _printable(text: str) -> str:
+    """Returns a text of a file that a terminal can show."""
+    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)

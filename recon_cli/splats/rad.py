@@ -1,0 +1,224 @@
+"""The .rad of Spark, version 1: a scene in chunks, with or without a tree of levels; only read.
+
+A file is RAD0, the length of a JSON, the JSON filled up to 8 bytes, and the chunks that it lists. A
+chunk is RADC, length and JSON likewise, the size of its properties (u64), and these, raw deflate
+each or plain. A property holds all first components, then all second ones. Where there is a tree,
+the Gaussians without children are the scene, and the others stand for them from afar.
+Coefficients are the property of each Gaussian, or of an entry of a palette in the first chunk.
+Source: https://github.com/sparkjsdev/spark, rust/spark-lib/src/rad.rs. Chunks in files of their own
+(.radc) are not read.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.scene.splats import SH_C0, TERMS
+from recon_cli.splats.foreign import FLAT, drop_not_finite
+from recon_cli.splats.format import LoadedScene, SplatFormat
+from recon_cli.splats.values import UntrustedFile, splats_from_arrays
+
+_MAGIC, _CHUNK_MAGIC = b"RAD0", b"RADC"
+_MOST_SPLATS, _MOST_CHUNKS, _CHUNK = 1 << 31, 1 << 16, 1 << 16
+_WORD = 8  # bytes, to which everything is filled up
+_BAND = {1: 9, 2: 15, 3: 21}  # coefficients of three channels, by degree
+_LEAST = 0.25 / 255  # of an opacity, as in the other formats of bytes
+
+Array = NDArray[Any]
+
+
+def load_rad(path: Path) -> LoadedScene:
+    """Returns the scene of a .rad: its Gaussians without children, in the file's order.
+
+    Those that are not finite are dropped, with a warning. FormatError if the file is damaged.
+    """
+    file = _RadFile(path)
+    columns = drop_not_finite(path, file.columns())
+    alphas = np.clip(columns["alpha"][:, 0].astype(np.float64), _LEAST, 1 - _LEAST)
+    count = len(alphas)
+    comment = file.meta.get("comment")
+    return LoadedScene(splats_from_arrays(path, {
+        "means": columns["center"], "quats": columns["orientation"],
+        "log_scales": columns["scales"], "logit_opacities": np.log(alphas / (1 - alphas)),
+        "sh_dc": (columns["rgb"] - 0.5) / SH_C0,
+        "sh_rest": np.concatenate([
+            np.zeros((count, 0), np.float32),
+            *(columns[f"sh{degree}"] for degree in range(1, file.degree + 1))],
+            axis=1).reshape(count, TERMS[file.degree], 3)}),
+        writer=comment if isinstance(comment, str) else "")
+
+
+class _RadFile(UntrustedFile):
+    """An open .rad; every method raises FormatError if it breaks its own promises."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _MAGIC, ".rad")
+        self.meta, self._start = self._json(0, _MAGIC)
+        self.integer(self.meta, "version", 1, 1)
+        self.count = self.integer(self.meta, "count", 1, _MOST_SPLATS)
+        self.degree = self.integer(self.meta, "maxSh", 0, 3, default=0)
+        self._codes: dict[int, Array] = {}  # palette of each degree, [K, 3 * terms]
+
+    def columns(self) -> dict[str, Array]:
+        """Returns the properties [N, ...] of the Gaussians that are the scene."""
+        chunks = self.meta.get("chunks")
+        if not isinstance(chunks, list) or not 0 < len(chunks) <= _MOST_CHUNKS:
+            raise self.error(f"chunks = {chunks!r:.40}; needed is a list")
+        parts = [self._chunk(chunk) for chunk in chunks]
+        found = sum(len(part["center"]) for part in parts)
+        if found != self.count:
+            raise self.error(f"{found:,} Gaussians in its chunks, but states {self.count:,}")
+        table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        children = table.pop("child_count", None)
+        if children is None:
+            return table
+        leaf = children[:, 0] == 0
+        if not leaf.any():
+            raise self.error("a tree without ends")
+        return {name: value[leaf] for name, value in table.items()}
+
+    def _chunk(self, entry: Any) -> dict[str, Array]:
+        """Returns the properties of a chunk by name."""
+        if not isinstance(entry, dict) or entry.get("filename") is not None:
+            raise self.error("chunks in other files, which are not read")
+        start = self._start + self.integer(entry, "offset", 0, len(self.data))
+        meta, payload = self._json(start, _CHUNK_MAGIC)
+        payload += _WORD  # the size of the properties, which each state their own
+        count = self.integer(meta, "count", 1, _CHUNK)
+        properties = meta.get("properties")
+        if not isinstance(properties, list) or not all(
+                isinstance(one, dict) and isinstance(one.get("property"), str)
+                for one in properties):
+            raise self.error(f"properties = {properties!r:.40}; needed is a list")
+        named = {one["property"]: one for one in properties}
+
+        def read(name: str, components: int, rows: int = count) -> Array:
+            if name not in named:
+                raise self.error(f"a chunk without {name}")
+            return self._property(named[name], payload, components, rows)
+
+        values = {name: read(name, 3) for name in ("center", "rgb", "scales", "orientation")}
+        values["alpha"] = read("alpha", 1)
+        if self.meta.get("lodTree"):
+            values["child_count"] = read("child_count", 1)
+        return values | self._harmonics(named, read)
+
+    def _harmonics(
+        self, named: Mapping[str, Any], read: Callable[..., Array]
+    ) -> dict[str, Array]:
+        """Returns the coefficients [N, 3 * terms] of each degree of a chunk."""
+        degrees = range(1, self.degree + 1)
+        if "sh_label" not in named:
+            return {f"sh{degree}": read(f"sh{degree}", _BAND[degree]) for degree in degrees}
+        entries = self.integer(self.meta, "shCodeCount", 1, _MOST_SPLATS)
+        if not self._codes:
+            self._codes = {
+                degree: read(f"sh{degree}_code", _BAND[degree], entries) for degree in degrees}
+        labels = read("sh_label", 1)[:, 0]
+        if labels.max() >= entries:
+            raise self.error(f"the label {labels.max()} of a palette of {entries}")
+        return {f"sh{degree}": self._codes[degree][labels] for degree in degrees}
+
+    def _property(
+        self, meta: Mapping[str, Any], payload: int, components: int, rows: int
+    ) -> Array:
+        """Returns a property [rows, components]: scales as logarithms, rotations as wxyz."""
+        name, encoding = meta["property"], meta.get("encoding")
+        decode = _ENCODINGS.get(encoding) if isinstance(encoding, str) else None
+        if decode is None:
+            raise self.error(f"{name} in the unknown encoding {encoding!r:.40}")
+        size = _SIZES.get(str(encoding), 1) * components * rows
+        offset = payload + self.integer(meta, "offset", 0, len(self.data))
+        data = self.data[offset: offset + self.integer(meta, "bytes", 0, len(self.data))]
+        if meta.get("compression") == "gz":
+            try:
+                data = zlib.decompressobj(-zlib.MAX_WBITS).decompress(data, size)
+            except zlib.error as error:
+                raise self.error(f"{name} that cannot be decompressed: {error}") from error
+        if len(data) < size or not size:
+            raise self.error(f"{len(data)} bytes of {name}; needed are {size}")
+        low, high = self._limits(meta)
+        values = decode(np.frombuffer(data, np.uint8, size), components, low, high)
+        if name == "scales" and encoding == "f32":
+            return np.log(np.maximum(values, math.exp(FLAT)))
+        if name == "orientation" and encoding != "oct88r8":
+            real = np.sqrt(np.maximum(0, 1 - (values * values).sum(axis=1, keepdims=True)))
+            return np.concatenate([real, values], axis=1)
+        return values
+
+    def _limits(self, meta: Mapping[str, Any]) -> tuple[float, float]:
+        """Returns the lowest and highest value of a property; 0 and 1 where it has none."""
+        if meta.get("max") is None:
+            return 0.0, 1.0
+        (high,) = self.numbers({"max": [meta["max"]]}, "max", 1, 1)
+        (low,) = self.numbers({"min": [meta.get("min") or 0.0]}, "min", 1, 1)
+        return float(low), float(high)
+
+    def _json(self, start: int, magic: bytes) -> tuple[dict[str, Any], int]:
+        """Returns the JSON at a place, and where what follows it begins."""
+        if self.data[start: start + 4] != magic or start + _WORD > len(self.data):
+            raise self.error(f"no {magic.decode()} at byte {start}")
+        length = int.from_bytes(self.data[start + 4: start + _WORD], "little")
+        text = self.data[start + _WORD: start + _WORD + length]
+        return self.json_object(text), start + _WORD + -(-length // _WORD) * _WORD
+
+
+def _columns(values: Array, components: int) -> Array:
+    """Returns values [components * N] as [N, components]."""
+    return values.reshape(components, -1).T
+
+
+def _from_planes(data: Array, components: int, kind: str) -> Array:
+    """Returns numbers [N, components] of which all first bytes come first."""
+    size = np.dtype(kind).itemsize
+    return _columns(np.ascontiguousarray(data.reshape(size, -1).T).view(kind)[:, 0], components)
+
+
+def _summed(data: Array, components: int) -> Array:
+    """Returns bytes [N, components] of their differences, modulo 256."""
+    return np.cumsum(_columns(data, components), axis=0, dtype=np.uint8)
+
+
+def _log_scales(data: Array, components: int, low: float, high: float) -> Array:
+    """Returns logarithms of bytes: 0 is flat, the others are 255 steps."""
+    steps = _columns(data, components).astype(np.float32)
+    return np.where(steps == 0, np.float32(FLAT), low + (steps - 1) * ((high - low) / 254))
+
+
+def _rotations(data: Array, _components: int, _low: float, _high: float) -> Array:
+    """Returns quaternions wxyz of an axis in an octahedron (2 bytes) and an angle (1 byte)."""
+    table = data.reshape(-1, 3) / np.float64(255)
+    x, y = (table[:, :2] * 2 - 1).T
+    z = 1 - abs(x) - abs(y)
+    fold = np.maximum(-z, 0)
+    axis = np.stack([np.where(x >= 0, x - fold, x + fold), np.where(y >= 0, y - fold, y + fold), z])
+    axis /= np.linalg.norm(axis, axis=0)
+    half = table[:, 2] * (math.pi / 2)
+    return np.stack([np.cos(half), *(axis * np.sin(half))], axis=1)
+
+
+_SIZES = {"f32": 4, "f16": 2, "f32_lebytes": 4, "f16_lebytes": 2, "ln_f16": 2, "u16": 2, "u32": 4}
+_ENCODINGS: dict[str, Callable[[Array, int, float, float], Array]] = {
+    "f32": lambda data, k, *_: _columns(data.view("<f4"), k),
+    "f16": lambda data, k, *_: _columns(data.view("<f2"), k).astype(np.float32),
+    "f32_lebytes": lambda data, k, *_: _from_planes(data, k, "<f4"),
+    "f16_lebytes": lambda data, k, *_: _from_planes(data, k, "<f2").astype(np.float32),
+    "ln_f16": lambda data, k, *_: _columns(data.view("<f2"), k).astype(np.float32),
+    "ln_0r8": _log_scales,
+    "r8": lambda data, k, low, high: low + _columns(data, k) / 255 * (high - low),
+    "r8_delta": lambda data, k, low, high: low + _summed(data, k) / 255 * (high - low),
+    "s8": lambda data, k, _, high: _columns(data.view(np.int8), k) / 127 * high,
+    "s8_delta": lambda data, k, _, high: _summed(data, k).view(np.int8) / 127 * high,
+    "oct88r8": _rotations,
+    "u16": lambda data, k, *_: _columns(data.view("<u2"), k),
+    "u32": lambda data, k, *_: _columns(data.view("<u4"), k),
+}
+
+FORMAT = SplatFormat(load=load_rad)

@@ -1,0 +1,100 @@
+"""What a first user types: a file in place of a verb, a verb without a file, options of others."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from recon_cli.cli import main
+from recon_cli.commands import budget
+from recon_cli.commands.budget import Budget
+from recon_cli.commands.options import Call
+from recon_cli.errors import ReconError
+from recon_cli.workspace.layout import Workspace
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> tuple[str, str]:
+    """The error and the hint of the last command."""
+    lines = capsys.readouterr().err.splitlines()
+    return tuple(next(line for line in lines if line.startswith(word))  # type: ignore[return-value]
+                 for word in ("error: ", "hint: "))
+
+
+def test_a_capture_in_place_of_a_verb_is_answered_by_the_command_for_it(capsys):
+    assert main(["my room.mp4"]) == 2
+    assert "`recon run 'my room.mp4'`" in said(capsys)[1]
+
+
+def test_a_folder_in_place_of_a_verb_is_too(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("photos").mkdir()
+    assert main(["photos"]) == 2
+    assert "`recon run photos`" in said(capsys)[1]
+
+
+def test_a_misspelt_verb_is_not_taken_for_a_capture(capsys):
+    assert main(["trian"]) == 2
+    assert "train" in said(capsys)[0]
+
+
+@pytest.mark.parametrize(("verb", "typed"), [("run", "run VIDEO"), ("ingest", "ingest VIDEO")])
+def test_without_an_input_the_command_to_type_is_said_and_nothing_is_left(
+        capsys, tmp_path, verb, typed):
+    folder = tmp_path / "ws"
+    assert main([verb, "-w", str(folder)]) == 2
+    assert f"`recon {typed}" in said(capsys)[1]
+    assert not folder.exists()
+
+
+def test_a_first_command_that_fails_leaves_no_folder_but_a_later_one_keeps_it(tmp_path):
+    folder = tmp_path / "ws"
+    assert main(["run", str(tmp_path / "missing.mp4"), "-w", str(folder)]) == 3
+    assert not folder.exists()
+    folder.mkdir()
+    assert main(["run", str(tmp_path / "missing.mp4"), "-w", str(folder)]) == 3
+    assert folder.exists()
+
+
+def test_a_folder_with_a_file_of_the_user_in_it_is_never_removed(tmp_path):
+    workspace = Workspace(tmp_path / "ws")
+
+    def fail() -> None:
+        with workspace.writing("run"):
+            (workspace.root / "mine.txt").touch()
+            raise ReconError("no")
+
+    with pytest.raises(ReconError):
+        fail()
+    assert (workspace.root / "mine.txt").exists()
+
+
+def test_an_option_of_a_stage_is_answered_by_its_set(capsys):
+    assert main(["run", "x", "--iterations", "5"]) == 2
+    assert "--set train.iterations=VALUE" in said(capsys)[1]
+    assert main(["run", "x", "--seed", "5"]) == 2
+    assert "--set sfm.seed=VALUE or --set train.seed=VALUE" in said(capsys)[1]
+
+
+def test_run_takes_the_options_that_first_users_look_for(capsys, tmp_path):
+    assert main(["run", "--print-config", "--quality", "draft", "--frames", "40", "--title", "Us",
+                 "-w", str(tmp_path / "ws")]) == 0
+    printed = capsys.readouterr().out
+    assert 'quality = "draft"' in printed
+    assert "frames = 40" in printed
+    assert 'title = "Us"' in printed
+    assert 'format = "html"' in printed
+
+
+def test_choices_for_a_time_are_kept_for_the_same_time_and_input(tmp_path):
+    call = Call(workspace=tmp_path)
+    video = tmp_path / "a.mp4"
+    chosen = Budget(minutes=5.0, inputs=(str(video),), frames=40, train_minutes=1.5, prune=True)
+    (tmp_path / budget.FILE).write_text(json.dumps(chosen.to_json()))
+    assert budget._recorded(call, 5.0, (video,)) == chosen
+    assert budget._recorded(call, 5.0, ()) == chosen
+    assert budget._recorded(call, 6.0, (video,)) is None
+    assert budget._recorded(call, 5.0, (tmp_path / "b.mp4",)) is None
+    call.again = True
+    assert budget._recorded(call, 5.0, (video,)) is None
