@@ -73,7 +73,7 @@ def test_a_training_that_is_looked_at_in_a_browser_is_the_same_to_the_byte(
     inputs, expected = plain
     with start_server(HOST, None, label="x") as (server, address):
         view = LiveView(server, Workspace(tmp_path))
-        page.page.set_viewport_size({"width": 320, "height": 240})
+        page.page.set_viewport_size({"width": 640, "height": 240})  # a narrow panel is folded
         page.page.goto(address)
         page.page.get_by_text("Waiting for the training").wait_for(timeout=60_000)
         until(page, server.get_clients)
