@@ -9,7 +9,6 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.budget import run_within
 from recon_cli.commands.ending import end_run, name_workspace, optional_page
 from recon_cli.commands.jobs import open_job_with, run_stages
 from recon_cli.commands.options import Call, pass_call, verb
@@ -227,6 +226,8 @@ def run(
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
     with optional_page(call):
         if minutes is not None and not call.print_config:
+            from recon_cli.commands.budget import run_within  # imports OpenCV
+
             run_within(call, minutes, inputs, RUN, with_prune=with_prune)
         else:
             run_stages(call, "run", stages, sources=inputs, base=RUN)
