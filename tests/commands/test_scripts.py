@@ -28,6 +28,7 @@ def _fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fake_stages.ran.clear()
     for module in (jobs, stages, workspace):
         monkeypatch.setattr(module, "STAGES", fake_stages.TABLE)
+    monkeypatch.setattr(stages, "end_run", lambda _call, **_: None)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("RECON_WORKSPACE", raising=False)
     (tmp_path / "room.mp4").write_text("a video")
