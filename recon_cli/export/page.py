@@ -78,7 +78,7 @@ def plan_tour(splats: Splats, cameras: Sequence[Camera], ctx: StageContext) -> T
         shown.append(_count_cells(points[_inner(seen) & seen & (depth > 0)], _CELL * distance))
     steady = gaussian_filter1d(
         minimum_filter1d(np.array(margins), 3, axis=0), _STEADY, axis=0, mode="nearest")
-    # what comes after the start is worth seeing too: the last quarter is no place to begin
+    # what comes after the start is worth seeing too: a tour does not begin in the last quarter
     start = int(np.argmax(shown[:max(1, 3 * len(shown) // 4)]))
     return Tour(places, np.clip(steady, 1.0, _MOST_MARGIN), seconds, start)
 

@@ -44,7 +44,7 @@ def open_file(path, flags, *rest, **more) -> int:
 
 
 def link(*arguments, **more) -> None:
-    """Makes hard links of what is no symbolic link."""
+    """Makes hard links of all but symbolic links."""
     if more.pop("follow_symlinks", True) is False:
         raise NotImplementedError("follow_symlinks unavailable on this platform")
     _link(*arguments, **more)
