@@ -51,7 +51,9 @@ def test_an_imported_scene_gets_better_and_says_where_it_comes_from(workspace, c
     assert summary(workspace)["imported_from"] == "room.ply"
     assert "continued_from_step" not in summary(workspace)
     assert main(["status", "-w", str(workspace)]) == 0
-    assert "imported from room.ply, iterations 120" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "after 120 iterations" in out
+    assert "continued from room.ply" in out
     for verb in ("eval", "prune", "export"):
         assert recon(verb, workspace) == 0
     assert "may have trained on the held-out views" in capsys.readouterr().err
