@@ -15,8 +15,9 @@ from pathlib import Path
 
 from recon_cli import machine
 from recon_cli.commands.jobs import open_job, run_stages
-from recon_cli.commands.options import Call
-from recon_cli.config.settings import Settings, merge
+from recon_cli.commands.options import Call, explicit_settings
+from recon_cli.config.settings import Settings, build, merge
+from recon_cli.config.stages import TrainConfig
 from recon_cli.errors import ReconError
 from recon_cli.sfm.time_estimate import Workload, expected_seconds, measure_slowness
 from recon_cli.workspace.atomic import read_json, write_json
@@ -51,8 +52,10 @@ def run_within(
     """Runs every stage in about so many minutes, and says what is given up for it."""
     began = time.monotonic()
     workspace = Workspace(call.workspace)
-    budget = _recorded(call, minutes, inputs) or Budget(
-        minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs))
+    given = merge([explicit_settings(call), call.settings])
+    # what contradicts a time, such as a number of steps, is refused before anything runs
+    build(TrainConfig, merge([base, {"train": {"minutes": minutes}}, given]))
+    budget = _recorded(call, minutes, inputs)
     threads = open_job(call).compute.threads or machine.usable_threads()
     slowness = measure_slowness(threads)
 
@@ -63,15 +66,16 @@ def run_within(
         run_stages(call, "run", names, sources=inputs if "ingest" in names else (), base=merge(
             [base, *chosen.values()]))
 
+    if budget is None:
+        stages("ingest")
+        fewer = None
+        if given.get("ingest", {}).get("frames") is None:
+            fewer = _fewer_frames(workspace, _SFM * 60 * minutes, threads, slowness)
+        budget = Budget(
+            minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), frames=fewer)
+        write_json(workspace.root / FILE, budget.to_json())
     frames: Settings = {} if budget.frames is None else {"ingest": {"frames": budget.frames}}
-    stages("ingest", frames=frames)
-    if budget.train_minutes is None:
-        fewer = _fewer_frames(call, workspace, _SFM * 60 * minutes, threads, slowness)
-        if fewer is not None:
-            budget = dataclasses.replace(budget, frames=fewer)
-            frames = {"ingest": {"frames": fewer}}
-            stages("ingest", frames=frames)
-    stages("denoise", "sfm", frames=frames)
+    stages("ingest", "denoise", "sfm", frames=frames)
     if budget.train_minutes is None:
         rest = left() - _SCORES * slowness
         seconds = max(rest / (1 + _PRUNE) if with_prune else rest, _LEAST_TRAINING * slowness)
@@ -107,14 +111,14 @@ def _recorded(call: Call, minutes: float, inputs: tuple[Path, ...]) -> Budget | 
 
 
 def _fewer_frames(
-    call: Call, workspace: Workspace, seconds: float, threads: int, slowness: float
+    workspace: Workspace, seconds: float, threads: int, slowness: float
 ) -> int | None:
     """Returns to how many frames a capture is cut for cameras in time; None: it stays."""
     manifest = workspace.manifest("ingest")
     assert manifest is not None
     ingested = IngestSummary.from_json(manifest.run.summary)
-    if call.settings.get("ingest", {}).get("frames") is not None or ingested.metric is not None:
-        return None  # asked for, or its cameras are known
+    if ingested.metric is not None:
+        return None  # its cameras are known
     megapixels = ingested.width * ingested.height / 1e6
 
     def estimate(frames: int) -> float:

@@ -87,6 +87,14 @@ def test_run_takes_the_options_that_first_users_look_for(capsys, tmp_path):
     assert 'format = "html"' in printed
 
 
+def test_a_time_and_a_number_of_steps_are_refused_before_anything_runs(tmp_path, capsys):
+    folder = tmp_path / "ws"
+    assert main(["run", "x.mp4", "--minutes", "2", "--set", "train.iterations=5", "-w",
+                 str(folder)]) == 2
+    assert "minutes" in said(capsys)[0]
+    assert not folder.exists()
+
+
 def test_choices_for_a_time_are_kept_for_the_same_time_and_input(tmp_path):
     call = Call(workspace=tmp_path)
     video = tmp_path / "a.mp4"
