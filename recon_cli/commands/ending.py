@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import shlex
 import webbrowser
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
 from recon_cli.commands.jobs import open_job
-from recon_cli.commands.options import Call, explicit_settings
-from recon_cli.errors import ReconstructionError
+from recon_cli.commands.options import Call
 from recon_cli.progress import format_megabytes
 from recon_cli.workspace.export_record import ExportSummary
-from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.records import read_frame_list
 from recon_cli.workspace.summaries import SfmSummary
-
-logger = logging.getLogger("recon")
 
 
 def end_run(call: Call, *, open_page: bool = False) -> None:
@@ -50,21 +43,6 @@ def end_run(call: Call, *, open_page: bool = False) -> None:
     click.echo(f"next:    {_next_command(call.workspace, page)}")
     if open_page:
         webbrowser.open((page or report).resolve().as_uri())
-
-
-@contextmanager
-def optional_page(call: Call) -> Iterator[None]:
-    """Makes a notice of a page that could not be written, where nobody asked for it by name."""
-    try:
-        yield
-    except ReconstructionError as error:
-        manifest = Workspace(call.workspace).manifest("export")
-        failure = manifest and ExportSummary.from_json(manifest.run.summary).failure()
-        asked = any("format" in settings.get("export", {})
-                    for settings in (call.settings, explicit_settings(call)))
-        if asked or not failure or failure.message != error.message:
-            raise
-        logger.warning("there is no page: %s", error.message)
 
 
 def _next_command(workspace: Path, page: Path | None) -> str:

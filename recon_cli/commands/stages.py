@@ -9,9 +9,9 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.ending import end_run, name_workspace, optional_page
+from recon_cli.commands.ending import end_run, name_workspace
 from recon_cli.commands.jobs import open_job_with, run_stages
-from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.commands.options import Call, explicit_settings, pass_call, verb
 from recon_cli.commands.view import show_training
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import (
@@ -28,10 +28,9 @@ from recon_cli.stages import IMPORT, STAGES
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
 MID: Settings = {"prune": {"at": "mid"}}  # as in the paper: prune midway through training
-RUN: Settings = {**MID, "export": {"format": "html"}}
 # Fewer steps than a capture of one's own gets: this room scores as 3DGS does after them already.
 # Surfaces by stereo would take a tenth of the time, for less than steps gain in it.
-DEMO: Settings = {**RUN, "train": {"iterations": 1700, "stereo": "off"}}
+DEMO: Settings = {**MID, "train": {"iterations": 1700, "stereo": "off"}}
 FORMS = ("text", "markdown", "csv", "latex", "json")
 
 _inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=options.PathType())
@@ -224,13 +223,12 @@ def run(
     scene (.ply), a page to look around in it (.html), and a report.
     """
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
-    with optional_page(call):
-        if minutes is not None and not call.print_config:
-            from recon_cli.commands.budget import run_within  # imports OpenCV
+    if minutes is not None and not call.print_config:
+        from recon_cli.commands.budget import run_within  # imports OpenCV
 
-            run_within(call, minutes, inputs, RUN, with_prune=with_prune)
-        else:
-            run_stages(call, "run", stages, sources=inputs, base=RUN)
+        run_within(call, minutes, inputs, _with_page(MID, call), with_prune=with_prune)
+    else:
+        run_stages(call, "run", stages, sources=inputs, base=_with_page(MID, call))
     if not call.print_config:
         end_run(call, open_page=with_open)
 
@@ -243,6 +241,13 @@ def run(
 @pass_call
 def demo(call: Call) -> None:
     """Run every stage on the bundled room video."""
-    with optional_page(call):
-        run_stages(call, "demo", [row.name for row in STAGES], sources=(SAMPLE,), base=DEMO)
+    stages = [row.name for row in STAGES]
+    run_stages(call, "demo", stages, sources=(SAMPLE,), base=_with_page(DEMO, call))
     end_run(call)
+
+
+def _with_page(base: Settings, call: Call) -> Settings:
+    """Returns settings with the page, which only who asks for formats by name gets for certain."""
+    asked = any("format" in settings.get("export", {})
+                for settings in (call.settings, explicit_settings(call)))
+    return {**base, "export": {"format": "html", "skip_lossy": not asked}}

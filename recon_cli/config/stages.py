@@ -394,6 +394,9 @@ class ExportConfig(StageConfig):
     max_loss: float | None = option(
         None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
         per_file=True, automatic=describe_max_loss())
+    skip_lossy: bool = option(
+        False, "Leave out a format that loses more than --max-loss, with a notice, instead of "
+        "failing.", per_file=True, expert=True)
     title: str | None = option(
         None, "Title of the page (html).", metavar="TEXT", per_file=True,
         automatic="from the name of the capture")

@@ -34,6 +34,7 @@ from recon_cli.splats.registry import FORMATS, format_of, load_splats
 from recon_cli.workspace import durable
 from recon_cli.workspace.atomic import sync_folder
 from recon_cli.workspace.export_formats import ExportFormat
+from recon_cli.workspace.export_record import LossLimit
 
 _VIEW_SIZE = 600  # pixels, longest side of the renders that a file is checked on
 _GUESSED_UP = "-y"  # of a file that does not say, as in viewers
@@ -143,15 +144,15 @@ def _write(
         FORMATS[row.name].write(path, splats, settings)
         verify_ply(path, splats, again="convert again")
         return 0.0
-    most = row.max_loss_db if request.max_loss is None else request.max_loss
+    limit = LossLimit.from_option(row, request.max_loss)
     gain = write_until_good(
         row, path, reducer.at_degree(splats, row.sh_degree), settings, reducer.psnr,
-        reference_db=ASSUMED_DB, most_db=most,
+        reference_db=ASSUMED_DB, limit=limit,
         max_bytes=None if request.max_mb is None else int(1e6 * request.max_mb))
-    if not gain >= -most:  # a NaN fails too
+    if not limit.allows(gain, ASSUMED_DB + gain):
         raise ReconstructionError(
-            f"{request.out} would lose {-gain:.2f} dB on {reducer.psnr.describe()}; {most:g} dB "
-            "are allowed.",
+            f"{request.out} would lose {-gain:.2f} dB on {reducer.psnr.describe()}; "
+            f"{limit.most_db:g} dB are allowed.",
             hint="Write another format, or allow more with --max-loss.")
     logger.info("checked on %s", reducer.psnr.describe())
     return gain

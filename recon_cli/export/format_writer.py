@@ -26,7 +26,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import write_points
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
-from recon_cli.workspace.export_record import ExportedFile, max_loss_db
+from recon_cli.workspace.export_record import ExportedFile, loss_limit
 
 _IMAGES = "images"
 _SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
@@ -84,23 +84,24 @@ class FormatWriter:
 
     def _write_gaussians(self, row: ExportFormat) -> ExportedFile:
         path = self._out / row.file
-        most = max_loss_db(row.name, dataclasses.asdict(self._config))
+        limit = loss_limit(row.name, dataclasses.asdict(self._config))
         limited = self._config.max_mb is not None and row.name == self._config.formats[0]
         gain = write_until_good(
             row, path, lower_degrees(self._splats, self._source).at(row.sh_degree),
             _settings(row, self._config, self._source), self._source.psnr,
-            reference_db=self._psnr_db, most_db=most,
+            reference_db=self._psnr_db, limit=limit,
             max_bytes=int(1e6 * (self._config.max_mb or 0)) if limited else None)
         size, ply_size = file_size(row, path), (self._out / "splats.ply").stat().st_size
         text = f"{row.name}: {ply_size / size:.1f}x smaller, {gain:+.2f} dB"
-        if not gain >= -most:  # a NaN fails too
+        if not limit.allows(gain, self._psnr_db + gain):
             raise ReconstructionError(
-                f"{text} on {self._source.psnr.describe()}, but it may lose {most:g} dB at most.",
+                f"{text} on {self._source.psnr.describe()}, but it may lose {limit.most_db:g} dB "
+                "at most.",
                 hint="Leave this format out, or allow more with --max-loss.")
         logger.info("%s", text)
         return ExportedFile(
             file=row.file, bytes=size, smaller=round(ply_size / size, 3),
-            psnr_change_db=round(gain, 4))
+            psnr_change_db=round(gain, 4), psnr_db=round(self._psnr_db + gain, 4))
 
     @cached_property
     def _psnr_db(self) -> float:

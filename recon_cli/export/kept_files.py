@@ -28,8 +28,8 @@ from recon_cli.workspace.export_record import (
     deciding_options,
     describe_changes,
     loss_is_small,
+    loss_limit,
     main_file,
-    max_loss_db,
     owns,
 )
 from recon_cli.workspace.layout import link_or_copy
@@ -102,7 +102,7 @@ def find_fresh(
         return set()
     options = dataclasses.asdict(config)
     return {name for name, record in records.items()
-            if not record.stale and loss_is_small(record, max_loss_db(name, options))}
+            if not record.stale and loss_is_small(record, loss_limit(name, options))}
 
 
 def discard_files(out: Path, name: str, written: Collection[str]) -> None:

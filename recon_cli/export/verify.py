@@ -23,6 +23,7 @@ from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.registry import FORMATS
 from recon_cli.workspace.export_formats import ExportFormat
+from recon_cli.workspace.export_record import LossLimit
 
 _VIEWS = 8  # rendered for each file, at most
 
@@ -37,19 +38,20 @@ class Psnr(Protocol):
 
 def write_until_good(
     row: ExportFormat, path: Path, splats: Splats, settings: WriteSettings, psnr: Psnr, *,
-    reference_db: float, most_db: float, max_bytes: int | None = None,
+    reference_db: float, limit: LossLimit, max_bytes: int | None = None,
 ) -> float:
     """Writes a file with ever less sharing, and returns its gain in dB over `reference_db`.
 
-    It stops where no more than `most_db` are lost, or the file is larger than `max_bytes`.
+    It stops where the loss is allowed, or the file is larger than `max_bytes`.
     """
     form, gain = FORMATS[row.name], -math.inf
     for sharing in row.sharing:
         form.write(path, splats, dataclasses.replace(settings, sharing=sharing))
         if max_bytes is not None and file_size(row, path) > max_bytes:
             break
-        gain = psnr.psnr_db(form.read(path)) - reference_db
-        if gain >= -most_db:
+        psnr_db = psnr.psnr_db(form.read(path))
+        gain = psnr_db - reference_db
+        if limit.allows(gain, psnr_db):
             break
     return gain
 

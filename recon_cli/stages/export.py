@@ -8,7 +8,7 @@ exported one.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ReconError, StageError, WorkspaceError
+from recon_cli.errors import ReconError, ReconstructionError, StageError, WorkspaceError
 from recon_cli.export.bounds import describe_bounds
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
 from recon_cli.export.format_writer import FormatWriter, measure_first
@@ -47,6 +47,7 @@ from recon_cli.workspace.export_record import (
     ExportSummary,
     FailedFormat,
     limited_format,
+    skip_options,
 )
 from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
 
@@ -87,13 +88,13 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         verify_ply(path, splats)
         bar.advance()
         writer = FormatWriter(splats, out, config, source, room_frame)
-        files, failed = _write_formats(others, writer, out, bar.advance)
+        files, failed = _write_formats(others, writer, out, config, bar.advance)
     record = ImportRecord.read(inputs.folders["train"])
     _write_transform(out / TRANSFORM, frame, record.origin if record else None)
     files = {name: dataclasses.replace(file, made_of=made_of(name, config, inputs, model))
              for name, file in files.items()}
     kept = keep_files(out, inputs.earlier, records, ["ply", *files])
-    notices = _notices(kept)
+    notices = _notices(kept, failed)
     for text in notices:
         ctx.notice(text)
     return ExportSummary(
@@ -111,7 +112,8 @@ def _is_antialiased(train: Path) -> bool:
 
 
 def _write_formats(
-    names: Sequence[str], writer: FormatWriter, out: Path, advance: Callable[[], None]
+    names: Sequence[str], writer: FormatWriter, out: Path, config: ExportConfig,
+    advance: Callable[[], None],
 ) -> tuple[dict[str, ExportedFile], dict[str, FailedFormat]]:
     """Writes the scene in each format; one that fails takes nothing from the others."""
     files: dict[str, ExportedFile] = {}
@@ -123,16 +125,21 @@ def _write_formats(
             raise
         except ReconError as error:
             discard_files(out, name, ["ply", *files])
-            failed[name] = FailedFormat(message=error.message, hint=error.hint)
+            skipped = config.skip_lossy and isinstance(error, ReconstructionError)
+            failed[name] = FailedFormat(
+                message=error.message, hint=error.hint, skipped_with=skip_options(
+                    name, dataclasses.asdict(config)) if skipped else None)
         advance()
     return files, failed
 
 
-def _notices(kept: KeptFiles) -> tuple[str, ...]:
-    """Returns notices about the files that are kept."""
+def _notices(kept: KeptFiles, failed: Mapping[str, FailedFormat]) -> tuple[str, ...]:
+    """Returns notices about the formats that are left out, and the files that are kept."""
     return (
         *(f"{file.file} is stale: {file.stale}. It is kept; --format {name} writes it again."
           for name, file in kept.files.items() if file.stale),
+        *(f"there is no {EXPORT_FORMATS[name].file}: {one.message} {one.hint}"
+          for name, one in failed.items() if one.skipped_with is not None),
         *(f"{old} was not written by recon, or changed since: it is kept as {new}."
           for old, new in kept.renamed.items()))
 

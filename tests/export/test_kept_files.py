@@ -18,7 +18,7 @@ from recon_cli.export import format_writer
 from recon_cli.export.kept_files import keep_files
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import read_ply, write_ply
-from recon_cli.workspace.export_record import ExportedFile
+from recon_cli.workspace.export_record import ExportedFile, LossLimit
 from recon_cli.workspace.layout import Workspace
 
 pytestmark = pytest.mark.integration
@@ -140,7 +140,7 @@ def test_an_option_of_one_format_makes_that_one_stale_alone(ws, capsys):
 
 def test_a_format_that_loses_too_much_takes_none_of_those_that_pass(ws, capsys, monkeypatch):
     monkeypatch.setattr(
-        format_writer, "max_loss_db", lambda name, _: -1.0 if name == "glb" else 0.5)
+        format_writer, "loss_limit", lambda name, _: LossLimit(-1.0 if name == "glb" else 0.5))
     assert run("export", ws, "--format", "glb,splat") == 5
     err = capsys.readouterr().err
     assert "glb: " in err
@@ -152,9 +152,25 @@ def test_a_format_that_loses_too_much_takes_none_of_those_that_pass(ws, capsys, 
     assert run("export", ws, "--format", "splat") == 0
 
 
+def test_a_format_that_may_be_left_out_is_named_and_leaves_the_export_fresh(
+    ws, capsys, monkeypatch
+):
+    monkeypatch.setattr(
+        format_writer, "loss_limit", lambda name, _: LossLimit(-1.0 if name == "glb" else 0.5))
+    words = ["--format", "glb,splat", "--skip-lossy"]
+    assert run("export", ws, *words) == 0
+    assert "there is no splats.glb: glb: " in capsys.readouterr().err
+    assert "splats.splat" in contents(ws)
+    assert run("export", ws, *words) == 0
+    assert "export is up to date" in capsys.readouterr().out
+    assert main(["status", "-w", str(ws)]) == 0
+    assert "stale" not in capsys.readouterr().out
+    assert run("export", ws, "--format", "glb") == 5  # who asks for it hears why
+
+
 def test_a_file_of_before_stays_where_a_format_fails(ws, monkeypatch):
     before = contents(ws)["splats.spz"]
-    monkeypatch.setattr(format_writer, "max_loss_db", lambda _name, _options: -1.0)
+    monkeypatch.setattr(format_writer, "loss_limit", lambda _name, _options: LossLimit(-1.0))
     assert run("export", ws, "--format", "spz", *BOX) == 5
     assert contents(ws)["splats.spz"] == before
     assert "spz" in stale_files(ws)

@@ -2,18 +2,22 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from recon_cli.config.stages import ExportConfig
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.export_record import (
+    CLEAN_DB,
     VERSION,
     ExportedFile,
     ExportSummary,
     FailedFormat,
     deciding_options,
     describe_changes,
+    loss_limit,
     owns,
+    skip_options,
 )
 
 
@@ -95,3 +99,37 @@ def test_each_format_has_files_of_its_own():
         assert [one for one in EXPORT_FORMATS if owns(one, path)] == [name]
     assert {one for one in EXPORT_FORMATS if owns(one, "images/a.png")} == {
         "colmap", "transforms.json"}
+
+
+@pytest.mark.parametrize(("change_db", "psnr_db", "passes"), [
+    (-0.2, 31.0, True), (-0.4, 31.0, False), (-0.4, 44.9, False), (-20.0, 45.1, True),
+    (float("nan"), float("nan"), False)])
+def test_a_loss_that_eight_bits_hide_passes_where_nobody_gave_a_limit(change_db, psnr_db, passes):
+    assert loss_limit("spz", options()).allows(change_db, psnr_db) is passes
+    given = loss_limit("spz", options(max_loss=0.3))
+    assert given.allows(change_db, psnr_db) is (passes and change_db > -0.3)
+    assert 10 * np.log10(12 * 255**2) > CLEAN_DB + 10  # rounding to 8 bits alone
+
+
+def test_a_clean_file_is_fresh_whatever_it_lost_unless_a_limit_is_given():
+    summary = exported()
+    clean = dataclasses.replace(summary.files["spz"], psnr_change_db=-9.0, psnr_db=54.0)
+    summary = dataclasses.replace(summary, files={"spz": clean})
+    assert summary.contradictions(options(format="spz")) == ()
+    assert summary.contradictions(options(format="spz", max_loss=1.0)) == (
+        "splats.spz loses more than 1 dB",)
+    unknown = dataclasses.replace(clean, psnr_db=None)  # written by an older version
+    assert dataclasses.replace(summary, files={"spz": unknown}).contradictions(
+        options(format="spz")) == ("splats.spz loses more than 0.3 dB",)
+
+
+def test_a_format_that_was_left_out_as_allowed_is_not_missed_until_it_is_asked_for():
+    allowed = options(format="html", skip_lossy=True)
+    left_out = FailedFormat(
+        message="It loses.", hint="", skipped_with=skip_options("html", allowed))
+    summary = ExportSummary.from_json(dataclasses.replace(
+        exported(), failed={"html": left_out}).to_json())
+    assert summary.failure() is None
+    assert summary.contradictions(allowed) == ()
+    for changed in ({"skip_lossy": False}, {"max_loss": 3.0}, {"title": "Room"}):
+        assert summary.contradictions({**allowed, **changed}) == ("html could not be written",)
