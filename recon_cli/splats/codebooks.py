@@ -31,7 +31,7 @@ def fit_codebook(values: Floats, rng: np.random.Generator) -> Floats:
         flat = np.append(rng.choice(flat, _SAMPLE, replace=False), ends)
     start = np.unique(np.concatenate([
         np.quantile(flat, np.linspace(0, 1, BOOK // 2)), np.linspace(*ends, BOOK // 2)]))
-    centres = np.sort(_lloyd(flat[:, None], start[:, None], _BOOK_ROUNDS)[:, 0])
+    centres = fit_centres_on_line(np.sort(flat), start, _BOOK_ROUNDS)
     return np.pad(centres, (0, BOOK - len(centres)), mode="edge").astype(np.float32)
 
 
@@ -90,6 +90,22 @@ def _choose_starts(rows: Floats, count: int, rng: np.random.Generator) -> Floats
     weights = far.mean() + far if far.any() else np.ones(len(far))
     count = min(count, len(rows))
     return rows[np.sort(rng.choice(len(rows), count, replace=False, p=weights / weights.sum()))]
+
+
+def fit_centres_on_line(
+    values: NDArray[np.float64], centres: NDArray[np.float64], rounds: int
+) -> NDArray[np.float64]:
+    """Returns ascending centres of ascending numbers, each of which belongs to one run of them."""
+    for _ in range(rounds):
+        ends = np.searchsorted(values, (centres[1:] + centres[:-1]) / 2)
+        starts, counts = np.append(0, ends), np.diff(np.append(0, ends), append=len(values))
+        used = counts > 0  # a centre without numbers keeps its value
+        moved = centres.copy()
+        moved[used] = np.add.reduceat(values, starts[used]) / counts[used]
+        if np.array_equal(moved, centres):
+            break
+        centres = moved
+    return centres
 
 
 def _lloyd(rows: NDArray[_Float], start: NDArray[_Float], rounds: int) -> NDArray[_Float]:

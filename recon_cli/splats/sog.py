@@ -22,6 +22,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -29,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from recon_cli.machine import usable_threads
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
 from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
@@ -392,16 +394,18 @@ def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> 
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
         archive.writestr(zipfile.ZipInfo(META, _DATE), text)
-        for name, pixels in images.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), encode_webp(pixels))
+        with ThreadPoolExecutor(usable_threads()) as pool:
+            for name, encoded in zip(images, pool.map(encode_webp, images.values()), strict=True):
+                archive.writestr(zipfile.ZipInfo(name, _DATE), encoded)
     return data.getvalue()
 
 
 def encode_webp(pixels: NDArray[np.uint8]) -> bytes:
     """Returns a lossless WebP of [H, W, 3] or [H, W, 4], exact under an alpha of 0 too."""
     data = io.BytesIO()
+    # Method 4 takes 3.5 times as long for 1% less to 0.4% more bytes.
     Image.fromarray(np.ascontiguousarray(pixels)).save(
-        data, "WEBP", lossless=True, exact=True, quality=75, method=4)
+        data, "WEBP", lossless=True, exact=True, quality=75, method=2)
     return data.getvalue()
 
 

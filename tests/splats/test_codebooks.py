@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from recon_cli.splats.codebooks import fit_codebook, fit_palette, nearest_entries
+from recon_cli.splats.codebooks import (
+    fit_centres_on_line,
+    fit_codebook,
+    fit_palette,
+    nearest_entries,
+)
 
 
 @pytest.fixture
@@ -19,6 +24,18 @@ def test_a_codebook_errs_no_more_than_even_steps_would(rng, draw):
     even = (values.max() - values.min()) / 256 / np.sqrt(12)
     # Even numbers cannot be beaten on even values; a sample of them comes close.
     assert np.sqrt((error.astype(np.float64) ** 2).mean()) < 1.05 * even
+
+
+def test_sorted_numbers_give_the_centres_of_lloyds_algorithm(rng):
+    values = np.sort(rng.standard_t(2, size=2_000))
+    centres = np.unique(np.append(np.linspace(*values[[0, -1]], 40), values[::100]))
+    expected = centres
+    for _ in range(5):
+        nearest = np.abs(values[:, None] - expected).argmin(axis=1)
+        expected = np.array([
+            values[nearest == k].mean() if (nearest == k).any() else centre
+            for k, centre in enumerate(expected)])
+    np.testing.assert_allclose(fit_centres_on_line(values, centres, 5), expected, rtol=1e-12)
 
 
 def test_as_many_values_as_numbers_are_kept_as_they_are(rng):
