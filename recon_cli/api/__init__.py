@@ -1,0 +1,1 @@
+"""Everything that recon does, from Python."""
