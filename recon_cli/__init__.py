@@ -13,10 +13,17 @@ __version__ = "0.1.0"
 # Each public name and the module that it is loaded from. A name that is also a folder of the
 # package, as `render` is, cannot stand here: importing the folder would replace it.
 _PUBLIC: dict[str, str] = {
-    # names of recon_cli.api go here, each a line: "Workspace": "recon_cli.api",
+    "Camera": "recon_cli.api",
+    "ReconError": "recon_cli.api",
+    "Splats": "recon_cli.api",
+    "Workspace": "recon_cli.api",
+    "evaluate": "recon_cli.api",
+    "look_at": "recon_cli.api",
+    "make_camera": "recon_cli.api",
+    "read_cameras": "recon_cli.api",
 }
 
-__all__ = ["__version__"]
+__all__ = ["__version__", *_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:

@@ -75,8 +75,8 @@ def render(
     color = splats.background if background is None else _check_color(background, splats)
     with computing(backend, device, threads) as ctx, torch.no_grad():
         output = registry.render(
-            splats.map(lambda tensor: tensor.detach().to(ctx.device)), camera,
-            color.to(ctx.device), degree, backend=ctx.backend)
+            _placed(splats, ctx), camera, color.to(ctx.device, torch.float32), degree,
+            backend=ctx.backend)
         expected = output.depth / output.alpha.clamp_min(1e-10)
         rgb, alpha, depth = (
             np.array(tensor.cpu().numpy(), np.float32)
@@ -102,11 +102,14 @@ def measure_contributions(
     views = [_blank_view(camera, mask) for camera, mask in zip(cameras, masks, strict=True)]
     with computing(backend, device, threads) as ctx:
         found = Importance.zeros(len(splats), torch.device(ctx.device))
-        add_views(found, splats.map(lambda tensor: tensor.detach().to(ctx.device)), views,
-                  sh_degree=degree, backend=ctx.backend)
+        add_views(found, _placed(splats, ctx), views, sh_degree=degree, backend=ctx.backend)
         hits, blend_max, loo = (
             tensor.cpu().numpy() for tensor in (found.hits, found.blend_max, found.loo))
         return Contributions(hits, blend_max, loo, found.views)
+
+
+def _placed(splats: Splats, ctx: StageContext) -> Splats:
+    return splats.map(lambda tensor: tensor.detach().to(ctx.device, torch.float32))
 
 
 def _blank_view(camera: Camera, mask: NDArray[np.bool_] | None) -> TrainView:

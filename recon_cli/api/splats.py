@@ -66,7 +66,9 @@ class Splats(scene_splats.Splats):
         cls, means: Array, quats: Array, scales: Array, opacities: Array, sh: Array, *,
         backdrop: Backdrop | None = None,
     ) -> Splats:
-        """Returns Gaussians of activated values, as the class names them; gradients pass through.
+        """Returns Gaussians of activated values, as the class names them.
+
+        Gradients pass through tensors, which stay of their type; all else becomes float32.
 
         Args:
             means: [N, 3].
@@ -129,11 +131,12 @@ class Splats(scene_splats.Splats):
 
 def _tensor(name: str, value: Array) -> Tensor:
     try:
-        tensor = value if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
+        if not isinstance(value, Tensor):
+            return torch.from_numpy(np.array(value, np.float32))
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} is not an array of numbers: {error}.",
                          hint="Give a NumPy array or a tensor.") from error
-    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
+    return value if value.dtype in (torch.float32, torch.float64) else value.float()
 
 
 def _check_shapes(values: dict[str, Tensor], n: int) -> None:
