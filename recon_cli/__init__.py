@@ -1,3 +1,32 @@
-"""Indoor 3D reconstruction by Gaussian Splatting that anyone can run."""
+"""Indoor 3D reconstruction by Gaussian Splatting that anyone can run.
+
+Public names are loaded when they are first used, so that `import recon_cli` takes milliseconds.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
 
 __version__ = "0.1.0"
+
+# Each public name and the module that it is loaded from. A name that is also a folder of the
+# package, as `render` is, cannot stand here: importing the folder would replace it.
+_PUBLIC: dict[str, str] = {
+    # names of recon_cli.api go here, each a line: "Workspace": "recon_cli.api",
+}
+
+__all__ = ["__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a public name; AttributeError for any other."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_PUBLIC[name]), name)
+    globals()[name] = value  # the next use does not come here
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PUBLIC})
