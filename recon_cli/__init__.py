@@ -6,17 +6,21 @@ Public names are loaded when they are first used, so that `import recon_cli` tak
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for type checkers; at run time `__getattr__` does the same
+    from recon_cli.render.rasterization import rasterization
 
 __version__ = "0.1.0"
 
 # Each public name and the module that it is loaded from. A name that is also a folder of the
 # package, as `render` is, cannot stand here: importing the folder would replace it.
-_PUBLIC: dict[str, str] = {
+_PUBLIC = {
+    "rasterization": "recon_cli.render.rasterization",
     # names of recon_cli.api go here, each a line: "Workspace": "recon_cli.api",
 }
 
-__all__ = ["__version__"]
+__all__ = ["__version__", "rasterization"]
 
 
 def __getattr__(name: str) -> Any:
