@@ -6,13 +6,27 @@ Public names are loaded when they are first used, so that `import recon_cli` tak
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for type checkers; at run time `__getattr__` does the same
+    from recon_cli.api import (
+        Camera,
+        ReconError,
+        Splats,
+        Workspace,
+        evaluate,
+        look_at,
+        make_camera,
+        read_cameras,
+    )
+    from recon_cli.render.rasterization import rasterization
 
 __version__ = "0.1.0"
 
 # Each public name and the module that it is loaded from. A name that is also a folder of the
 # package, as `render` is, cannot stand here: importing the folder would replace it.
-_PUBLIC: dict[str, str] = {
+_PUBLIC = {
+    "rasterization": "recon_cli.render.rasterization",
     "Camera": "recon_cli.api",
     "ReconError": "recon_cli.api",
     "Splats": "recon_cli.api",
@@ -23,7 +37,8 @@ _PUBLIC: dict[str, str] = {
     "read_cameras": "recon_cli.api",
 }
 
-__all__ = ["__version__", *_PUBLIC]
+__all__ = ["Camera", "ReconError", "Splats", "Workspace", "__version__", "evaluate", "look_at",
+           "make_camera", "rasterization", "read_cameras"]
 
 
 def __getattr__(name: str) -> Any:
