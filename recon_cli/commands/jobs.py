@@ -9,20 +9,18 @@ from typing import Any
 
 import click
 
-from recon_cli.commands.options import Call, explicit_settings
+from recon_cli.api.runs import OpenWorkspace, RunRequest
+from recon_cli.commands.options import Call
 from recon_cli.commands.sentences import describe_summary, fresh_files
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import TrainCallback
 from recon_cli.jobs.executor import NEEDS_GPU, Executor, start_executor
-from recon_cli.pipeline import plan
-from recon_cli.pipeline.continuation import Start
-from recon_cli.pipeline.plan import Job, Outcome, Target
+from recon_cli.pipeline.execute import Job, Outcome
 from recon_cli.progress import TqdmProgress, format_duration
-from recon_cli.stages import IMPORT, STAGES, Stage
+from recon_cli.stages import STAGES, Stage
 from recon_cli.workspace.export_record import ExportSummary
-from recon_cli.workspace.layout import Workspace
 
 logger = logging.getLogger("recon")
 
@@ -38,26 +36,22 @@ def run_stages(
     ingest. `base` are defaults, over which recon.toml, --config and options win; `forced` wins over
     everything. An empty `table` stands for STAGES.
     """
-    table = table or STAGES
-    file_settings = explicit_settings(call)
-    values = layers.merge([base or {}, file_settings, call.settings, forced or {}])
-    rows = [row for row in table if row.name in stages]
-    configs = {layers.section_of(row.config): layers.build(row.config, values) for row in rows}
-    compute = layers.build(ComputeConfig, values)
+    request = RunRequest(
+        verb, tuple(stages), sources, base or {}, call.settings, forced or {}, again=call.again,
+        from_import=call.from_import, callbacks=callbacks, table=tuple(table))
+    workspace = open_workspace(call)
     if call.print_config:
-        click.echo(layers.to_toml({**configs, "compute": compute}), nl=False)
+        click.echo(layers.to_toml(workspace.resolve(request)), nl=False)
         return
-    job = Job(
-        Workspace(call.workspace), file_settings, compute, TqdmProgress(), report_outcome, table,
-        callbacks)
-    start = Start.IMPORTED if call.from_import else Start.AUTO
-    targets = [
-        Target(row.name, config, sources if row.input_metavar else (),
-               start if row.name == IMPORT.name else Start.AUTO)
-        for row, config in zip(rows, configs.values(), strict=True)]
-    plan.run(job, verb, targets, again=call.again)
+    workspace.run(request, report_outcome)
     if "evaluate" in stages:
-        click.echo((job.workspace.folder("evaluate") / "table.txt").read_text(encoding="utf-8"))
+        click.echo((workspace.path / "evaluate" / "table.txt").read_text(encoding="utf-8"))
+
+
+def open_workspace(call: Call) -> OpenWorkspace:
+    """Returns the workspace of a command line, with what -w, --config and --set say."""
+    return OpenWorkspace(
+        call.workspace, call.config_file, call.assigned, TqdmProgress(), tuple(STAGES))
 
 
 def open_job(call: Call) -> Job:
@@ -67,11 +61,7 @@ def open_job(call: Call) -> Job:
 
 def open_job_with(call: Call, kind: type[C]) -> tuple[Job, C]:
     """Returns a job as `open_job` does, and the options of one config class."""
-    file_settings = explicit_settings(call)
-    values = layers.merge([file_settings, call.settings])
-    compute = layers.build(ComputeConfig, values)
-    job = Job(Workspace(call.workspace), file_settings, compute, TqdmProgress(), table=STAGES)
-    return job, layers.build(kind, values)
+    return open_workspace(call).open_job(kind, call.settings)
 
 
 def report_outcome(outcome: Outcome) -> None:

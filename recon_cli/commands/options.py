@@ -20,12 +20,10 @@ import click
 from recon_cli.commands.console import LOG_FORMATS, CapturedOutput, Style
 from recon_cli.config.fields import OptionInfo, StageConfig, field_type, member_types, option_info
 from recon_cli.config.settings import (
-    FILE,
     Settings,
-    check,
     merge,
     parse_assignment,
-    read_settings,
+    read_explicit,
     section_of,
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
@@ -143,13 +141,7 @@ def verb(name: str) -> Callable[[Command], Verb]:
 
 def explicit_settings(call: Call) -> Settings:
     """Returns the values of recon.toml, --config and --set; ConfigError if one cannot be used."""
-    in_workspace = call.workspace / FILE
-    # A link that leads nowhere is an error, not the same as none.
-    files = [in_workspace] if os.path.lexists(in_workspace) else []
-    files += [call.config_file] if call.config_file else []
-    settings = merge([*map(read_settings, files), call.assigned])
-    check(settings)
-    return settings
+    return read_explicit(call.workspace, call.config_file, call.assigned)
 
 
 def _store(name: str) -> Callable[[click.Context, click.Parameter, Any], None]:

@@ -143,4 +143,5 @@ def report(call: Call, out: Path | None) -> None:
     """
     from recon_cli.report.build import write_report
 
-    click.echo(write_report(open_job(call), out))
+    path = write_report(open_job(call), out)
+    click.echo(f"{path}: {format_megabytes(path.stat().st_size)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import os
 import shlex
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -66,13 +67,29 @@ def read_settings(path: Path) -> Settings:
             f"{path} is not valid TOML: {reason}.", hint=f"Fix {path.name}.") from error
     settings = _drop_gone(settings)
     for section, values in settings.items():
-        _check_names(section, (), where=str(path))
+        check_names(section, (), where=str(path))
         if not isinstance(values, dict):
             raise ConfigError(
                 f"{path} sets {section} to {values!r}, but it is a section.",
                 hint=f"Write [{section}] on a line of its own and its fields below it.")
-        _check_names(section, values, where=str(path))
+        check_names(section, values, where=str(path))
         _check_values(section, values, where=f"{path}: {section}.")
+    return settings
+
+
+def read_explicit(
+    workspace: Path, config_file: Path | None = None, assigned: Settings | None = None
+) -> Settings:
+    """Returns what the recon.toml of a workspace, another file and `assigned` set; later ones win.
+
+    ConfigError if a file or a value cannot be used.
+    """
+    in_workspace = workspace / FILE
+    # A link that leads nowhere is an error, not the same as none.
+    files = [in_workspace] if os.path.lexists(in_workspace) else []
+    files += [config_file] if config_file else []
+    settings = merge([*map(read_settings, files), assigned or {}])
+    check(settings)
     return settings
 
 
@@ -99,7 +116,7 @@ def parse_assignment(text: str) -> Settings:
         raise ConfigError(
             f"--set takes section.field=value, but got {text!r}.",
             hint="For example --set train.iterations=1000.")
-    _check_names(section, [name], where="--set")
+    check_names(section, [name], where="--set")
     settings = {section: {name: _parse_value(section, name, value.strip())}}
     _check_values(section, settings[section], where=f"--set {section}.")
     return settings
@@ -126,7 +143,7 @@ def _parse_value(section: str, name: str, text: str) -> Any:
             hint="Change it in --set.") from error
 
 
-def _check_names(section: str, names: Iterable[str], *, where: str) -> None:
+def check_names(section: str, names: Iterable[str], *, where: str) -> None:
     """Raises ConfigError unless the section and its fields exist; `where` sets them."""
     if section not in SECTIONS:
         raise ConfigError(

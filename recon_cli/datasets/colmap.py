@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -23,6 +24,8 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, NamedImage, count_images, model_suffix, read_model
 from recon_cli.io.images import decode_file
 from recon_cli.scene.camera import MODELS, Lens
+
+logger = logging.getLogger("recon")
 
 _CHECKED = 5  # images, evenly spread
 _POINTS = 5000  # of the model, evenly spread; a view shows about a tenth of them
@@ -147,6 +150,27 @@ def read_colmap(folder: Path) -> PosedSet:
     if len(model.points):
         posed = replace(posed, points=model.points, colors=model.colors)
     return replace(posed, notices=(*model_notices, *notices, *posed.notices))
+
+
+def list_cameras(folder: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
+    """Returns the name, lens and [4, 4] world to camera of each image of a model, by name.
+
+    The images need not exist, unless the model lacks the file with their names. FormatError if it
+    is damaged.
+    """
+    place = _find_model(folder)
+    if place is None:
+        raise FormatError(f"{folder} holds no COLMAP model.")
+    model_at = folder / place[0]
+    if place[0] != ".":
+        model_at, notices = _choose_model(model_at)
+        for notice in notices:
+            logger.warning("%s", notice)
+    model = read_model(model_at)
+    if not model.images:
+        return [(image.name, image.lens, image.viewmat) for image in read_colmap(folder).images]
+    return [(name, model.lenses[camera], viewmat)
+            for name, camera, viewmat in sorted(model.images, key=lambda image: image[0])]
 
 
 def _find_model(folder: Path) -> tuple[str, tuple[str, ...]] | None:

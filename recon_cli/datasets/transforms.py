@@ -174,6 +174,39 @@ def read_transforms(path: Path) -> PosedSet:
         notices=(*notices, *posed.notices, *point_notices))
 
 
+def list_cameras(path: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
+    """Returns the name, lens and [4, 4] world to camera of every frame, whatever part it is of.
+
+    The images need not exist where the file states their size. FormatError if a file is damaged or
+    a frame incomplete.
+    """
+    lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
+    finder = FileFinder(path.parent if path.is_file() else path, [
+        entry["file_path"] for _, _, (_, entries) in lists for entry in entries
+        if "file_path" in entry])
+    frames, _ = _drop_duplicates([
+        frame for file, part, (common, entries) in lists
+        for frame in _list_entries(file, part, common, entries, finder)])
+    return [(name, _stated_lens(frame), _viewmat(frame))
+            for frame, name in zip(frames, _short_names(frames), strict=True)]
+
+
+def _stated_lens(frame: _Frame) -> Lens:
+    """Returns the lens of a frame at the size that its file states, or else of its image."""
+    if frame.entry.get("w") is None or frame.entry.get("h") is None:
+        if not is_file(frame.path):
+            raise FormatError(
+                f"{frame.where} states no size (w, h), and its image {frame.path} is missing.",
+                hint="Add w and h in pixels, or copy the images too.")
+        return read_lens(frame.entry, image_size(frame.path), frame.where)
+    return read_lens(frame.entry, (0, 0), frame.where)
+
+
+def _viewmat(frame: _Frame) -> NDArray[np.float64]:
+    return viewmat_from_pose(
+        frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
+
+
 def _describe_unread(frames: Sequence[_Frame]) -> list[str]:
     """Returns a notice about depth that is named by another key than nerfstudio's."""
     other = sum(frame.entry.get("depth_path") is not None
@@ -282,12 +315,10 @@ def _short_names(frames: Sequence[_Frame]) -> list[str]:
 
 
 def _list_frame(frame: _Frame, name: str, held_out: str, finder: FileFinder) -> PosedImage:
-    viewmat = viewmat_from_pose(
-        frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
     depth, unit = _beside(frame, "depth_file_path", finder), _unit(frame)
     return PosedImage(
-        name, frame.path, lens, viewmat, frame.part == held_out,
+        name, frame.path, lens, _viewmat(frame), frame.part == held_out,
         None if depth is None else DepthFile(depth, unit, lens),
         _beside(frame, "mask_path", finder))
 

@@ -34,17 +34,17 @@ CONVENTION_LINES = (  # below tables
 _MAX_DB = 100.0  # of equal images, which JSON cannot hold
 _LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them
 
-Perceptual = Callable[[NDArray[np.float32], NDArray[np.uint8]], float]
+Perceptual = Callable[[NDArray[np.float32], NDArray[Any]], float]
 
 
 def psnr(
-    image: NDArray[Any], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+    image: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None = None
 ) -> float:
     """Returns 10 log10(1 / MSE) in dB of an image [H, W, 3], at most 100 dB.
 
-    The image is of 8 bits, or float and clamped to [0, 1]; `mask` [H, W] is True where used.
+    Both are of 8 bits, or float and clamped to [0, 1]; `mask` [H, W] is True where used.
     """
-    error = _unit(image) - truth / 255.0
+    error = _unit(image) - _unit(truth)
     if mask is not None:
         error = error[mask]
     return float(-10 * np.log10(max(float(np.mean(error**2)), 1e-10)))
@@ -64,7 +64,7 @@ def corrected_psnr(
 
 
 def ssim(
-    image: NDArray[np.float32], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None,
+    image: NDArray[np.float32], truth: NDArray[Any], mask: NDArray[np.bool_] | None = None,
     *, padded: bool = False,
 ) -> float:
     """Returns the structural similarity of an image [H, W, 3] clamped to [0, 1].
@@ -76,7 +76,7 @@ def ssim(
     """
     if min(truth.shape[:2]) < MIN_SIDE:
         raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
-    rendered, true = _unit(image), truth / 255.0
+    rendered, true = _unit(image), _unit(truth)
     if mask is not None:
         if not without_border(mask).any():
             raise ValueError("SSIM of a mask that leaves no pixel off the border")
@@ -110,11 +110,11 @@ def load_lpips() -> tuple[Perceptual | None, str]:
                       "lpips.LPIPS(net='alex')\"` fetches them once")
     network = lpips.LPIPS(net="alex", verbose=False).eval()
 
-    def distance(image: NDArray[np.float32], truth: NDArray[np.uint8]) -> float:
+    def distance(image: NDArray[np.float32], truth: NDArray[Any]) -> float:
         with torch.no_grad():  # of [1, 3, H, W] in [-1, 1]
             return float(network(*(
                 torch.from_numpy(pixels.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1
-                for pixels in (np.clip(image, 0, 1), truth / 255.0))))
+                for pixels in (np.clip(image, 0, 1), _unit(truth)))))
 
     return distance, ""
 

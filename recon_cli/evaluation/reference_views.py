@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -82,6 +82,21 @@ def render_view(splats: Splats, camera: Camera, sh_degree: int, backend: str) ->
         return render(splats, camera, splats.background, sh_degree, backend=backend)
 
 
+def score_image(
+    name: str, image: NDArray[np.float32], truth: NDArray[Any],
+    mask: NDArray[np.bool_] | None = None, *, perceptual: Perceptual | None = None,
+) -> ViewScore:
+    """Returns the scores of an image [H, W, 3], not clamped, against its truth of the same size.
+
+    The truth is of 8 bits, or float in [0, 1]. A view with a mask has no LPIPS.
+    """
+    return ViewScore(
+        name, psnr(image, truth, mask), psnr(to_uint8(image), truth, mask),
+        ssim(image, truth, mask), ssim(image, truth, mask, padded=True),
+        perceptual(image, truth) if perceptual is not None and mask is None else None,
+        None if mask is None else float(mask.mean()))
+
+
 def score_views(
     splats: Splats, views: Sequence[ReferenceView], sh_degree: int, backend: str,
     *, perceptual: Perceptual | None = None, threads: int = 1,
@@ -94,11 +109,7 @@ def score_views(
     """
     def score(view: ReferenceView, image: NDArray[np.float32]) -> tuple[ViewScore, float]:
         photo, mask = view.image, view.mask
-        scores = ViewScore(
-            view.name, psnr(image, photo, mask), psnr(to_uint8(image), photo, mask),
-            ssim(image, photo, mask), ssim(image, photo, mask, padded=True),
-            perceptual(image, photo) if perceptual is not None and mask is None else None,
-            None if mask is None else float(mask.mean()))
+        scores = score_image(view.name, image, photo, mask, perceptual=perceptual)
         on_view(view, image)
         return scores, corrected_psnr(image, photo, mask)
 

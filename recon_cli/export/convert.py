@@ -30,7 +30,7 @@ from recon_cli.splats.axes import UP, nearest_up
 from recon_cli.splats.coarsen import coarsen
 from recon_cli.splats.format import LoadedScene, WriteSettings
 from recon_cli.splats.lod import discard_levels
-from recon_cli.splats.registry import FORMATS, format_of, load_splats
+from recon_cli.splats.registry import FORMATS, check_writable, load_splats
 from recon_cli.workspace import durable
 from recon_cli.workspace.atomic import sync_folder
 from recon_cli.workspace.export_formats import ExportFormat
@@ -116,16 +116,7 @@ def convert(request: ConvertRequest, ctx: StageContext) -> Converted:
 
 def _check_out(request: ConvertRequest) -> ExportFormat:
     """Returns the format of the file to write; InputError or FormatError if it cannot be made."""
-    out, row = request.out, format_of(request.out)
-    if row.name not in FORMATS:
-        raise FormatError(
-            f"{out} cannot be written: .{row.name} is only read.",
-            hint=f"Write one of {', '.join(FORMATS)}.")
-    if not out.parent.is_dir():
-        raise InputError(f"The folder of {out} does not exist.",
-                         hint=f"Make it: `mkdir -p {out.parent}`.")
-    if out.is_dir():
-        raise InputError(f"{out} is a folder.", hint="Give the name of a file.")
+    out, row = request.out, check_writable(request.out)
     if out.exists() and not request.force:
         raise InputError(f"{out} exists already.", hint="Give another name, or add --force.")
     if request.transforms and len(request.transforms) != len(request.inputs):

@@ -42,6 +42,18 @@ class Approximation:
 EXACT = Approximation()
 
 
+@dataclass(frozen=True, eq=False)
+class EllipseGradients:
+    """Gradients of a loss by what M Gaussians are projected to; see `render.view_gradient`."""
+
+    ids: Tensor  # [M] int64, row of each in the splats
+    # [M, 5] sums over the pixels of s (u, v, u^2, uv, v^2), s = alpha dL/dalpha and (u, v) the
+    # whitened offset of a pixel from the mean, so that q = u^2 + v^2
+    moments: Tensor
+    colors: Tensor  # [M, 3], also where a colour was clamped at 0
+    depths: Tensor  # [M]
+
+
 _ALIGNED = 64  # numbers: kernels are compiled anew for addresses that are aligned otherwise
 
 
@@ -66,6 +78,8 @@ class Statistics:
     # d the first (d+1)^2 - 1 coefficients of sh_rest are in use. Gaussians behind the camera or
     # beside the image need not be counted.
     broken: int = 0
+    keep_ellipses: bool = False  # set it after the forward pass, and backward() writes `ellipses`
+    ellipses: EllipseGradients | None = None
 
     @staticmethod
     def zeros(like: Tensor) -> Statistics:

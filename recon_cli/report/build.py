@@ -52,8 +52,8 @@ _HERE = Path(__file__).parent
 _TEXT_PER_VIEW = 1_000  # bytes around a view's pictures, at most
 
 
-def write_report(job: Job, out: Path | None) -> str:
-    """Writes the report of a workspace, which is only read, and returns its path and size.
+def write_report(job: Job, out: Path | None) -> Path:
+    """Writes the report of a workspace, which is only read, and returns its path.
 
     `out` is report.html in the workspace by default. StageError if ingest has not run yet,
 ManifestError if its manifest cannot be trusted; ConfigError if `out` is not an HTML file, or
@@ -71,7 +71,7 @@ ManifestError if its manifest cannot be trusted; ConfigError if `out` is not an 
         raise WorkspaceError(
             f"{path} cannot be written: {error.strerror}.",
             hint="Give another file with -o.") from error
-    return f"{path}: {format_megabytes(len(page))}"
+    return path
 
 
 def _check_path(job: Job, path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -70,12 +71,13 @@ class Splats:
         """Returns the raw parameters by name, in declaration order; no copies."""
         return {name: getattr(self, name) for name in PARAMETERS}
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Splats:
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """Returns splats whose every parameter went through `change`."""
-        changed = {name: change(value) for name, value in self.parameters().items()}
-        return Splats.from_parameters(changed, self.backdrop)
+        changed: dict[str, Any] = {
+            name: change(value) for name, value in self.parameters().items()}
+        return replace(self, **changed)
 
-    def select(self, rows: Tensor) -> Splats:
+    def select(self, rows: Tensor) -> Self:
         """Returns the Gaussians at `rows` ([K] indices or [N] mask), detached, in that order.
 
         Raises:
@@ -89,16 +91,17 @@ class Splats:
         count = int(colored.sum())
         if not bool(colored[:count].all()):
             raise ValueError("rows put Gaussians of degree 0 before some that have coefficients")
-        taken = {name: value.detach()[rows[:count] if name == "sh_rest" else rows]
-                 for name, value in self.parameters().items()}
-        return Splats.from_parameters(taken, self.backdrop)
+        taken: dict[str, Any] = {
+            name: value.detach()[rows[:count] if name == "sh_rest" else rows]
+            for name, value in self.parameters().items()}
+        return replace(self, **taken)
 
     def within(self, center: Sequence[float], distance: float) -> Tensor:
         """Returns which centres lie within `distance` of `center` [3], [N] bool."""
         apart: Tensor = (self.means.detach() - self.means.new_tensor(center)).norm(dim=1)
         return apart <= distance
 
-    def with_degree(self, degree: int) -> Splats:
+    def with_degree(self, degree: int) -> Self:
         """Returns the splats with coefficients of this degree: cut, or filled up with zeros."""
         return replace(self, sh_rest=with_terms(self.sh_rest, TERMS[degree]))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
@@ -34,16 +34,35 @@ def format_of(path: Path) -> ExportFormat:
     return max(found, key=lambda row: len(row.ending))  # .compressed.ply before .ply
 
 
+def check_writable(path: Path) -> ExportFormat:
+    """Returns the row of a file to write by its name; FormatError or InputError if it cannot be."""
+    row = format_of(path)
+    if row.name not in FORMATS:
+        raise FormatError(
+            f"{path} cannot be written: .{row.name} is only read.",
+            hint=f"Write one of {', '.join(FORMATS)}.")
+    if not path.parent.is_dir():
+        raise InputError(f"The folder of {path} does not exist.",
+                         hint=f"Make it: `mkdir -p {path.parent}`.")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder.", hint="Give the name of a file.")
+    return row
+
+
 def read_splats(path: Path) -> Splats:
     """Returns the Gaussians of a file in any format where the file has them.
 
     FormatError if it is damaged.
     """
-    scene = load_splats(path)
+    return put_in_place(load_splats(path), path.name)
+
+
+def put_in_place(scene: LoadedScene, name: str) -> Splats:
+    """Returns the Gaussians where the file `name` has them, with a warning if that rounds."""
     if scene.origin is None:
         return scene.splats
     logger.warning("%s: %s, and added again here, rounded; `recon import` leaves it out",
-                   path.name, scene.origin.describe())
+                   name, scene.origin.describe())
     return replace(scene.splats, means=scene.splats.means + torch.tensor(scene.origin.point))
 
 

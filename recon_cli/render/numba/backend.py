@@ -111,6 +111,8 @@ class _Render(torch.autograd.Function):
             PackedSplats.from_tensors(tensors), PackedSplats.from_tensors(gradients),
             ImageBuffers(flat(grad_rgb), flat(grad_alpha), flat(grad_depth)), ctx.statistics,
             details=True, loo=ctx.scores)
+        if ctx.statistics.keep_ellipses:
+            ctx.statistics.ellipses = ctx.lease.view_pass.ellipse_gradients()
         grad_background = None
         if ctx.needs_input_grad[0]:
             grad_background = (grad_rgb * (1 - ctx.alpha)[..., None]).sum((0, 1))

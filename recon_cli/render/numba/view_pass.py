@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.render.contract import EXACT, Approximation, Statistics
+from recon_cli.render.contract import EXACT, Approximation, EllipseGradients, Statistics
 from recon_cli.render.numba import binning
 from recon_cli.render.numba.composite_backward import BACKWARD_FLOATS, composite_backward
 from recon_cli.render.numba.compositing import FORWARD_FLOATS, composite, tally
@@ -22,7 +23,8 @@ from recon_cli.render.numba.crossing import find_crossing
 from recon_cli.render.numba.project_backward import GRADIENT_FLOATS, project_backward
 from recon_cli.render.numba.projection import compact, cull, project
 from recon_cli.render.numba.soa import (
-    BLOCK, PROJECTION_FLOATS, RECORD, SLOT, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH)
+    BLOCK, GRAD_BLUE, GRAD_DEPTH, GRAD_RED, LOG2_E, PROJECTION_FLOATS, RECORD, S_U, S_VV, SLOT,
+    TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH)
 from recon_cli.kernels.viewpoint import viewpoint
 from recon_cli.kernels.thread_pool import SCRATCH_FLOATS, empty_aligned, pool
 from recon_cli.scene.camera import Camera
@@ -234,6 +236,20 @@ class ViewPass:
             gradients.means, gradients.quats, gradients.log_scales, gradients.logit_opacities,
             gradients.sh_dc, gradients.sh_rest, flat(statistics.means2d_grad),
             flat(statistics.variance), flat(statistics.loo))
+
+
+    def ellipse_gradients(self) -> EllipseGradients:
+        """Returns what the last backward pass summed over the pixels of each Gaussian."""
+        m = len(self.ids)
+        sums = self.take("sums", len(self.members) * SLOT).reshape(-1, SLOT)[:, :S_VV + 1]
+        totals = torch.segment_reduce(  # in order: the same bits every time
+            torch.from_numpy(np.ascontiguousarray(sums)), "sum", axis=0, unsafe=True, initial=0,
+            lengths=torch.from_numpy(np.diff(self.slot_start[:m + 1])))
+        # u and v of the kernels hold a factor of sqrt(log2(e) / 2)
+        factors = totals.new_tensor([2 / LOG2_E] * 5).pow(totals.new_tensor([0.5, 0.5, 1, 1, 1]))
+        return EllipseGradients(
+            torch.from_numpy(self.ids.astype(np.int64)), totals[:, S_U:S_VV + 1] * factors,
+            totals[:, GRAD_RED:GRAD_BLUE + 1].clone(), totals[:, GRAD_DEPTH].clone())
 
 
 _MOST_FREE = 2  # passes that are kept for their next use

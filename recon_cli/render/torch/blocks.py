@@ -72,15 +72,20 @@ def build_table(
     channels: Tensor,  # [M, 4]
 ) -> Table:
     """Returns the table of M projected Gaussians with its empty last row."""
-    _, b, c = cov2d.double().unbind(-1)
-    det = det.double()
-    whitening = torch.stack([(c / det).sqrt(), -b / (c * det).sqrt(), c.rsqrt()], dim=-1)
+    whitening = whitening_factors(cov2d, det)
     ones = torch.ones_like(log_o)[:, None]
     return Table(
         torch.nn.functional.pad(means2d.double(), (0, 0, 0, 1)),
         torch.nn.functional.pad(whitening, (0, 0, 0, 1)),
         torch.nn.functional.pad(log_o, (0, 1), value=-torch.inf),
         torch.nn.functional.pad(torch.cat([channels, ones], dim=-1), (0, 0, 0, 1)))
+
+
+def whitening_factors(cov2d: Tensor, det: Tensor) -> Tensor:
+    """Returns (l11, l12, l22) [M, 3] float64 with q = (l11 dx + l12 dy)^2 + (l22 dy)^2."""
+    _, b, c = cov2d.double().unbind(-1)
+    det = det.double()
+    return torch.stack([(c / det).sqrt(), -b / (c * det).sqrt(), c.rsqrt()], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +208,7 @@ def gradients_of(
     whitening: Tensor,  # [M, 3]
     directions: Tensor,  # [M, 2, 3]
     log_scales: Tensor,  # [M, 3]
+    dilation: float = DILATION,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Returns the gradients of means2d [M, 2], directions [M, 2, 3] and log_scales [M, 3].
 
@@ -219,8 +225,8 @@ def gradients_of(
     scales = log_scales.double().exp()[:, None]
     vx, vy = (directions.double() * scales).unbind(1)
     # vx - b/c vy = (0.3 vx + vy x (vx x vy)) / c, in which no long terms cancel
-    c = (vy * vy).sum(-1) + DILATION
-    across = DILATION * vx + torch.linalg.cross(vy, torch.linalg.cross(vx, vy))
+    c = (vy * vy).sum(-1) + dilation
+    across = dilation * vx + torch.linalg.cross(vy, torch.linalg.cross(vx, vy))
     p, q = (l11 / c)[:, None] * across, l22[:, None] * vy  # the rows of P
     e = uu[:, None] * p + uv[:, None] * q
     f = uv[:, None] * p + vv[:, None] * q

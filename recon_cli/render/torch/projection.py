@@ -8,6 +8,7 @@ follows the visible Gaussians.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -58,36 +59,41 @@ class Projection:
     colors: Tensor  # [M, 3] seen from this camera, at least 0
     depths: Tensor  # [M] z in camera coordinates, world units
     broken: int  # Gaussians that were culled because a value is not finite
+    dilation: float  # pixels^2 added to the diagonal of the covariances
 
 
-def project(splats: Splats, camera: Camera, sh_degree: int) -> Projection:
+def project(
+    splats: Splats, camera: Camera, sh_degree: int, dilation: float = DILATION
+) -> Projection:
     """Returns the Gaussians that may touch the image, projected and sorted by depth.
 
     Culled are Gaussians nearer than NEAR, of opacity under 1/255, whose ellipse of alpha = 1/255
-    misses the image, or that hold or are projected to a value that is not finite.
+    misses the image, or that hold or are projected to a value that is not finite. `dilation` stands
+    in place of the 0.3 of the covariance.
     """
     sh_degree = min(sh_degree, splats.sh_degree)
     with torch.no_grad():
         every = torch.arange(len(splats), device=splats.means.device)
         finite = _finite(splats, sh_degree)
         every = every[finite & _in_front(splats, camera)]
-        means2d, directions, _ = _project_rows(splats, camera, every)
-        cov2d, det = covariances(directions, splats.log_scales[every])
+        means2d, directions, _ = project_rows(splats.means[every], splats.quats[every], camera)
+        cov2d, det = covariances(directions, splats.log_scales[every], dilation)
         half = half_extents(cov2d, splats.opacities[every])
         sound = torch.isfinite(torch.cat([means2d, half, det[:, None]], dim=-1)).all(-1)
         broken = int((~finite).sum() + (~sound).sum())
         ids = every[sound & _touches_image(means2d, half, camera)]
         depths = (splats.means[ids] @ _rotation(splats, camera)[2]) + camera.viewmat[2, 3]
         ids = ids[torch.argsort(depths, stable=True)]
-    means2d, directions, depths = _project_rows(splats, camera, ids)
+    means2d, directions, depths = project_rows(splats.means[ids], splats.quats[ids], camera)
     log_scales = splats.log_scales[ids]
-    cov2d, det = covariances(directions, log_scales)
+    cov2d, det = covariances(directions, log_scales, dilation)
     center = torch.as_tensor(camera.center, dtype=means2d.dtype, device=means2d.device)
     colors = colors_from_sh(
         splats.means[ids] - center, splats.sh_dc[ids], splats.sh_rest, ids, sh_degree)
     opacities = torch.sigmoid(splats.logit_opacities[ids])
     projection = Projection(
-        ids, means2d, directions, log_scales, cov2d, det, opacities, colors, depths, broken)
+        ids, means2d, directions, log_scales, cov2d, det, opacities, colors, depths, broken,
+        dilation)
     lit = torch.isfinite(colors).all(-1)
     return projection if bool(lit.all()) else _without(projection, ~lit)
 
@@ -95,8 +101,9 @@ def project(splats: Splats, camera: Camera, sh_degree: int) -> Projection:
 def _without(projection: Projection, dark: Tensor) -> Projection:
     """Returns the projection without the rows whose colour overflowed, a mask [M]."""
     rows = {item.name: getattr(projection, item.name) for item in fields(projection)}
-    broken = rows.pop("broken") + int(dark.sum())
-    return Projection(**{name: tensor[~dark] for name, tensor in rows.items()}, broken=broken)
+    broken, dilation = rows.pop("broken") + int(dark.sum()), rows.pop("dilation")
+    rows = {name: tensor[~dark] for name, tensor in rows.items()}
+    return Projection(**rows, broken=broken, dilation=dilation)
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -139,11 +146,30 @@ def _in_front(splats: Splats, camera: Camera) -> Tensor:
     return visible
 
 
-def _project_rows(splats: Splats, camera: Camera, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns means2d [M, 2], directions [M, 2, 3] and depths [M] of some rows."""
-    R = _rotation(splats, camera)
+class Pinhole(Protocol):
+    """A `Camera`, or the same with tensors, to which gradients flow."""
+
+    @property
+    def width(self) -> int: ...  # noqa: D102
+    @property
+    def height(self) -> int: ...  # noqa: D102
+    @property
+    def viewmat(self) -> Any: ...  # noqa: D102
+    @property
+    def fx(self) -> Any: ...  # noqa: D102
+    @property
+    def fy(self) -> Any: ...  # noqa: D102
+    @property
+    def cx(self) -> Any: ...  # noqa: D102
+    @property
+    def cy(self) -> Any: ...  # noqa: D102
+
+
+def project_rows(means: Tensor, quats: Tensor, camera: Pinhole) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns means2d [M, 2], directions [M, 2, 3] and depths [M] of centres and rotations [M]."""
+    R = torch.as_tensor(camera.viewmat[:3, :3], dtype=means.dtype, device=means.device)
     t = torch.as_tensor(camera.viewmat[:3, 3], dtype=R.dtype, device=R.device)
-    x, y, z = (splats.means[ids] @ R.T + t).unbind(-1)
+    x, y, z = (means @ R.T + t).unbind(-1)
     u, v = x / z, y / z
     means2d = torch.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], dim=-1)
 
@@ -157,18 +183,20 @@ def _project_rows(splats: Splats, camera: Camera, ids: Tensor) -> tuple[Tensor, 
     row_x = (camera.fx / z)[:, None] * (R[0] - u[:, None] * R[2])  # [M, 3], first row of J R
     row_y = (camera.fy / z)[:, None] * (R[1] - v[:, None] * R[2])
     rows = torch.stack([row_x, row_y], dim=1)
-    return means2d, rows @ rotation_matrices(splats.quats[ids]), z
+    return means2d, rows @ rotation_matrices(quats), z
 
 
 @torch.no_grad()
-def covariances(directions: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
+def covariances(
+    directions: Tensor, log_scales: Tensor, dilation: float = DILATION
+) -> tuple[Tensor, Tensor]:
     """Returns the dilated covariances on the image, [M, 3], and their determinants [M]."""
     vx, vy = (directions * log_scales.exp()[:, None, :]).unbind(1)
     a, b, c = (vx * vx).sum(-1), (vx * vy).sum(-1), (vy * vy).sum(-1)
     # a c - b^2 cancels for needles; |vx x vy|^2 does not (Lagrange)
     cross = torch.linalg.cross(vx, vy)
-    det = (cross * cross).sum(-1) + DILATION * (a + c + DILATION)
-    return torch.stack([a + DILATION, b, c + DILATION], dim=-1), det
+    det = (cross * cross).sum(-1) + dilation * (a + c + dilation)
+    return torch.stack([a + dilation, b, c + dilation], dim=-1), det
 
 
 def half_extents(cov2d: Tensor, opacities: Tensor) -> Tensor:

@@ -12,7 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon_cli.render.contract import ALPHA_MAX, TILE, RenderOutput, Statistics
+from recon_cli.render.contract import (
+    ALPHA_MAX,
+    DILATION,
+    TILE,
+    EllipseGradients,
+    RenderOutput,
+    Statistics,
+)
 from recon_cli.render.torch.binning import Instances, bin_to_tiles
 from recon_cli.render.torch.blocks import (
     CHANNELS,
@@ -36,10 +43,13 @@ from recon_cli.scene.splats import Splats
 
 def render(
     splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
-    mask: Tensor | None = None,
+    mask: Tensor | None = None, dilation: float = DILATION,
 ) -> RenderOutput:
-    """Renders by the contract; see `recon_cli.render.registry.render`."""
-    projection = project(splats, camera, sh_degree)
+    """Renders by the contract; see `recon_cli.render.registry.render`.
+
+    `dilation` is what is added to the covariance on the image, pixels^2.
+    """
+    projection = project(splats, camera, sh_degree, dilation)
     with torch.no_grad():
         instances = bin_to_tiles(projection, camera.width, camera.height)
         statistics = Statistics.zeros(splats.means)
@@ -200,8 +210,12 @@ class _Rasterize(torch.autograd.Function):
         if scored is not None:
             _write_scores(_reduce(scored, instances), per_gaussian, projection.ids, statistics)
         shape = [gradient.to(means2d.dtype) for gradient in gradients_of(
-            per_gaussian[:, 5:10], table.whitening[:-1], directions, log_scales)]
+            per_gaussian[:, 5:10], table.whitening[:-1], directions, log_scales,
+            projection.dilation)]
         statistics.means2d_grad[projection.ids] = shape[0]
+        if statistics.keep_ellipses:
+            statistics.ellipses = EllipseGradients(
+                projection.ids, per_gaussian[:, 5:10], per_gaussian[:, :3], per_gaussian[:, 3])
         return None, *shape, per_gaussian[:, 10], per_gaussian[:, :4], grad_background
 
 

@@ -16,6 +16,7 @@ from recon_cli.render.triton.passes import (
     build_tile_lists,
     composite_tiles,
     composite_tiles_backward,
+    ellipse_gradients,
     project_splats,
     project_splats_backward,
 )
@@ -92,6 +93,8 @@ class _Render(torch.autograd.Function):
         gradients = splats.map(torch.empty_like)
         project_splats_backward(
             ViewInput(splats, view, terms), lists, sums, options, gradients, statistics)
+        if statistics.keep_ellipses:
+            statistics.ellipses = ellipse_gradients(lists, sums, plain=plain)
         grad_background = None
         if ctx.needs_input_grad[0]:
             grad_background = (grad_rgb * (1 - image.alpha)[..., None]).sum((0, 1))

@@ -1,6 +1,6 @@
 """The kernels of a view in their order, host side: projection, tile lists, compositing, gradients.
 
-Nothing here waits for the device.
+Nothing here waits for the device, but `ellipse_gradients`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import torch
 import triton
 from torch import Tensor
 
-from recon_cli.render.contract import Statistics
+from recon_cli.render.contract import EllipseGradients, Statistics
 from recon_cli.render.triton import projection as kernels
 from recon_cli.render.triton.compositing import (
     BUCKET,
@@ -21,6 +21,7 @@ from recon_cli.render.triton.compositing import (
     SIDE,
     STATE,
     SUMS,
+    UNIT,
     composite,
     composite_backward,
     tally,
@@ -261,3 +262,16 @@ def project_splats_backward(
         harmonics_backward[(triton.cdiv(coefficients, _COEFFICIENTS),)](
             directions, gradients.sh_dc, coefficients, sh_rest, STRIDE=stride, TERMS=source.terms,
             BLOCK=_COEFFICIENTS)
+
+
+def ellipse_gradients(lists: TileLists, sums: Tensor, *, plain: bool) -> EllipseGradients:
+    """Returns what `composite_tiles_backward` summed, by Gaussian; `plain` as it was there."""
+    lengths = (lists.starts[1:] - lists.starts[:-1]).long()
+    totals = torch.segment_reduce(
+        sums[:, :10].contiguous(), "sum", lengths=lengths, axis=0, unsafe=True, initial=0)
+    ids = torch.nonzero(lengths)[:, 0]
+    totals = totals[ids]
+    # u and v of the kernels hold a factor UNIT
+    factors = totals.new_tensor([1 / UNIT.value] * 5).pow(totals.new_tensor([1, 1, 2, 2, 2]))
+    depths = torch.zeros_like(totals[:, 3]) if plain else totals[:, 3]
+    return EllipseGradients(ids, totals[:, 5:10] * factors, totals[:, :3], depths)
