@@ -101,6 +101,7 @@ class Metrics(JsonRecord):
     masked_out_test: tuple[str, ...] | None = None  # held-out frames whose masks leave too little
     imported_from: str | None = None  # name of the file of an imported scene
     base_recipe: str | None = None  # REFERENCE where base was trained so; None: not, or unknown
+    protocol: str | None = None  # of `recon train --protocol`, if it was followed up to the scores
     frames: int | None = None  # of ingest; None, as the next two, in files of older versions
     training_views: int | None = None  # None for an imported scene, too
     unregistered: tuple[str, ...] | None = None  # names of all frames without a camera
@@ -118,8 +119,9 @@ class Metrics(JsonRecord):
 
     def label(self, model: str) -> str:
         """Returns the label of a model in tables: 3DGS only where it was trained as 3DGS is."""
-        return self.base_recipe if model == "base" and self.base_recipe else (
+        name = self.base_recipe if model == "base" and self.base_recipe else (
             MODEL_LABELS.get(model, model))
+        return f"{name} (protocol {self.protocol})" if self.protocol else name
 
     @classmethod
     def read(cls, evaluate: Path) -> Self:
