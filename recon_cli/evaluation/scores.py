@@ -199,6 +199,13 @@ class Table:
         table = "".join("| " + " | ".join(line) + " |\n" for line in lines)
         return f"### {self.title}\n\n{table}".rstrip() if self.title else table
 
+    def csv(self) -> str:
+        """Returns the table as CSV, below its title where it has one."""
+        file = io.StringIO()
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([*[[self.title]] * bool(self.title), self.headings, *self.rows])
+        return file.getvalue()
+
     def latex(self, caption: str = "", label: str = "") -> str:
         """Returns the table in LaTeX, as a float where it has a caption or label; needs booktabs.
 
