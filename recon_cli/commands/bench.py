@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -13,9 +13,13 @@ from click.core import ParameterSource
 from recon_cli.commands import options
 from recon_cli.commands.options import Call, Command, Decorator, pass_call
 from recon_cli.config import settings
+from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.experiments.outputs import OutputFiles
 from recon_cli.progress import TqdmProgress
+
+if TYPE_CHECKING:
+    from recon_cli.experiments.study import Design
 
 _FILE = options.PathType(dir_okay=False)
 _SCENE = options.PathType()
@@ -29,14 +33,20 @@ class SceneOptions:
     max_size: int
     max_gaussians: int
 
-    def fields(self, call: Call, *, validation: float | None = None) -> dict[str, Any]:
-        """Returns the fields of an ExperimentRequest; `validation` as in `runner.base_config`."""
+    def fields(
+        self, call: Call, *, validation: float | None = None, defaults: Settings | None = None
+    ) -> dict[str, Any]:
+        """Returns the fields of an ExperimentRequest; `validation` as in `runner.base_config`.
+
+        `defaults` are settings that --set may change.
+        """
         from recon_cli.experiments.runner import base_config
 
+        assigned = settings.merge([defaults or {}, call.assigned])
         return {
-            "scenes": self.paths, "settings": call.assigned,
+            "scenes": self.paths, "settings": assigned,
             "compute": settings.build(ComputeConfig, call.settings),
-            "base": base_config(call.assigned, max_size=self.max_size,
+            "base": base_config(assigned, max_size=self.max_size,
                                 max_gaussians=self.max_gaussians, validation=validation)}
 
 
@@ -189,6 +199,12 @@ bench.add_command(train)
 @click.command("study")
 @_scene_options
 @click.option(
+    "--replica", type=options.PathType(file_okay=False), metavar="DIR",
+    help="Fill the paper's Tables I and II: DIR holds the rooms of Replica (room0 to room2, "
+         "office0 to office4), SCENE are own captures. 3DGS, the paper's prune and ours, at equal "
+         "steps, on 200 frames a room; defaults become 30000 steps, 1200 pixels, 400000 "
+         "Gaussians and one seed.  [default: none]")
+@click.option(
     "--seeds", type=click.IntRange(min=1), default=5, metavar="N",
     help="Runs of each variant, with seeds 0 to N - 1.  [default: 5]")
 @click.option(
@@ -203,14 +219,45 @@ bench.add_command(train)
          "made again.  [default: study]")
 @_compute_options
 @pass_call
-def study(call: Call, /, scenes: SceneOptions, **typed: Any) -> None:
+def study(call: Call, /, scenes: SceneOptions, replica: Path | None, **typed: Any) -> None:
     """Repeat the paper's experiment: 3DGS against ours.
 
     Trains 3DGS, 3DGS with the paper's prune, ours and ours pruned on every SCENE, at equal steps
     and at equal seconds, and scores them on held-out views, with intervals over the seeds.
     """
-    from recon_cli.experiments.study import StudyRequest, run
+    from recon_cli.experiments.study import STUDY, StudyRequest, run
 
+    design, defaults = STUDY, None
+    if replica is not None:
+        scenes, design, defaults = _fill_paper_tables(replica, scenes, typed)
     # nothing looks at validation views here, so all but the test views are trained on
-    request = StudyRequest(**scenes.fields(call, validation=0.0), **typed)
+    request = StudyRequest(
+        **scenes.fields(call, validation=0.0, defaults=defaults), **typed, design=design)
     click.echo(run(request, TqdmProgress()).text())
+
+
+def _fill_paper_tables(
+    replica: Path, scenes: SceneOptions, typed: dict[str, Any]
+) -> tuple[SceneOptions, Design, Settings]:
+    """Returns scenes, design and settings of --replica; sets steps and seeds that were not given.
+
+    Raises:
+        InputError: the folder holds no room, or an incomplete one.
+    """
+    from recon_cli.experiments import replica as rooms
+    from recon_cli.experiments.study import PAPER_TABLES
+
+    context = click.get_current_context()
+
+    def choose(name: str, given: int, default: int) -> int:
+        typed_in = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        return given if typed_in else default
+
+    typed["iterations"] = choose("iterations", typed["iterations"], rooms.ITERATIONS)
+    typed["seeds"] = choose("seeds", typed["seeds"], 1)
+    found = SceneOptions(
+        (*rooms.find_rooms(replica), *scenes.paths),
+        choose("max_size", scenes.max_size, rooms.SIZE),
+        choose("max_gaussians", scenes.max_gaussians, rooms.MAX_GAUSSIANS))
+    return found, PAPER_TABLES, {
+        "ingest": {"frames": rooms.FRAMES}, "train": {"images": "original"}}

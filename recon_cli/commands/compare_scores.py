@@ -29,12 +29,13 @@ from recon_cli.workspace.layout import Workspace
 
 def compare(
     open_job: Callable[[Path], tuple[Job, EvaluateConfig]], workspace: Path,
-    items: Sequence[Path], form: str,
+    items: Sequence[Path], form: str, *, caption: str = "", label: str = "",
 ) -> str:
     """Returns the scores of several workspaces and files, in their order.
 
     Files are scored on the held-out views of `workspace`, in whose world they must lie. `open_job`
-    returns the job and the options of a workspace; `form` is text, markdown, csv, latex or json.
+    returns the job and the options of a workspace; `form` is text, markdown, csv, json or latex,
+    which takes `caption` and `label`.
     InputError if an item is neither a workspace nor a file.
     """
     _check_items(items)
@@ -51,7 +52,7 @@ def compare(
         else:
             held_out = held_out or _load_held_out(*open_job(workspace))
             models.append(score_file(path, names[path], *held_out))
-    return format_comparison(models, form)
+    return format_comparison(models, form, caption=caption, label=label)
 
 
 def _check_items(items: Sequence[Path]) -> None:

@@ -160,14 +160,24 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 @click.option(
     "--form", type=click.Choice(FORMS), default="text",
     help="With ITEM or --seeds: format of the table.  [default: text]")
+@click.option(
+    "--caption", default="", metavar="TEX",
+    help="With ITEM and --form latex: caption of the table.  [default: none]")
+@click.option(
+    "--label", default="", metavar="TEX",
+    help="With ITEM and --form latex: label of the table.  [default: none]")
 @options.stage(EvaluateConfig, renders=True)
 @pass_call
-def evaluate(call: Call, items: tuple[Path, ...], seeds: int | None, form: str) -> None:
+def evaluate(
+    call: Call, items: tuple[Path, ...], seeds: int | None, form: str, caption: str, label: str
+) -> None:
     """Score every model on the held-out views.
 
     With ITEM, workspaces and splat files (.ply, .spz, .sog, .splat, .glb): their models in one
     table. Files are scored on the views of the workspace.
     """
+    if (caption or label) and (form != "latex" or not items):
+        raise click.UsageError("--caption and --label need ITEM and --form latex.")
     if items and seeds:
         raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
     if seeds:
@@ -180,7 +190,7 @@ def evaluate(call: Call, items: tuple[Path, ...], seeds: int | None, form: str) 
 
         click.echo(compare(
             lambda path: open_job_with(dataclasses.replace(call, workspace=path), EvaluateConfig),
-            call.workspace, items, form))
+            call.workspace, items, form, caption=caption, label=label))
         return
     run_stages(call, "eval", ["evaluate"])
 

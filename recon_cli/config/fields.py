@@ -32,6 +32,9 @@ class OptionInfo:
     hashed: bool = True  # the field affects the result, and so the fingerprint of its stage
     # it decides on some files of its stage alone: their records are compared, not the fingerprint
     per_file: bool = False
+    # it came later: at its default it is left out of the fingerprint, so that older results stay
+    # fresh
+    late: bool = False
     expert: bool = False  # --help leaves it to --help-all
     # help of each choice that gets a flag of its own in place of one option: --force
     flags: Mapping[str, str] = field(default_factory=dict)
@@ -134,11 +137,21 @@ class StageConfig:
         return tuple(
             item.name for item in dataclasses.fields(cls) if option_info(item).per_file)
 
+    @classmethod
+    def late_fields(cls) -> tuple[str, ...]:
+        """Returns the fields that the fingerprint leaves out at their default."""
+        return tuple(item.name for item in dataclasses.fields(cls) if option_info(item).late)
+
+    @classmethod
+    def refuse_contradictions(cls, values: Mapping[str, Any]) -> None:
+        """Raises ConfigError where options that are given, default or not, exclude each other."""
+
     def hashed_fields(self) -> dict[str, Any]:
         """Returns the fields that affect the result, for the fingerprint; a tuple as a list."""
         values = {
             item.name: getattr(self, item.name) for item in dataclasses.fields(self)
-            if option_info(item).hashed}
+            if option_info(item).hashed and not (
+                option_info(item).late and getattr(self, item.name) == item.default)}
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in values.items()}

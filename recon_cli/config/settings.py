@@ -187,7 +187,9 @@ def merge(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
 
 def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
     """Returns the config of one class with the values of `settings`."""
-    return config(**settings.get(section_of(config), {}))
+    values = settings.get(section_of(config), {})
+    config.refuse_contradictions(values)
+    return config(**values)
 
 
 def section_of(config: type[StageConfig]) -> str:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from recon_cli.config import protocols
 from recon_cli.config.fields import StageConfig, option
 from recon_cli.errors import ConfigError
 from recon_cli.workspace.atomic import read_json
@@ -173,6 +176,9 @@ class TrainConfig(StageConfig):
         choices=("draft", "normal", "high"))
     minutes: float | None = option(
         None, "Time budget.", unit="minutes", minimum=0.01, automatic="none")
+    protocol: str | None = option(
+        None, "Protocol of the literature's tables: 3DGS as published, or our recipe.",
+        choices=tuple(protocols.PROTOCOLS), automatic="none", late=True)
     densify: str = option(
         "budget", "Add Gaussians where the error is (budget) or as 3DGS does (reference).",
         choices=("budget", "reference"))
@@ -192,11 +198,11 @@ class TrainConfig(StageConfig):
         automatic="auto, by image detail, steps and memory")
     early_stop: bool = option(True, "Skip to the final phase once validation PSNR stops improving.")
     images: str = option(
-        "auto", "Training pixels; auto: denoised if a trial improves validation PSNR.",
+        "auto", "Pixels to use; auto: by a trial.",
         choices=("auto", "denoised", "original"))
     far: str = option(
-        "auto", "Add background Gaussians where there are no sparse points; auto: if a trial "
-        "improves validation PSNR.", choices=("auto", "on", "off"))
+        "auto", "Add background Gaussians where there are no sparse points; auto: by a trial.",
+        choices=("auto", "on", "off"))
     stereo: str = option(
         "auto", "Start with Gaussians on surfaces that dense stereo finds and sparse points leave "
         "out; auto: on.",
@@ -247,6 +253,7 @@ class TrainConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_number_of("train", "blocks", self.blocks)
+        self._follow_protocol()
         if self.mid < DENSIFY_UNTIL:
             raise ConfigError(
                 f"mid is {self.mid:g}, but densification runs until {DENSIFY_UNTIL:g} of the run "
@@ -258,9 +265,27 @@ class TrainConfig(StageConfig):
                 "the length of the training.",
                 hint="Leave out --iterations or --minutes, here and in recon.toml.")
 
+    def _follow_protocol(self) -> None:
+        """Sets what the protocol fixes; ConfigError where an option asks for something else."""
+        for name, value in protocols.fixed_options(self).items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def refuse_contradictions(cls, values: Mapping[str, Any]) -> None:
+        """Raises ConfigError where an option that is given differs from what a protocol fixes."""
+        protocols.refuse_contradictions(cls, values)
+
 
 @dataclass(frozen=True)
-class RunConfig(TrainConfig):
+class SettledConfig(TrainConfig):
+    """TrainConfig whose protocol was followed: what it leaves automatic may be filled in."""
+
+    def _follow_protocol(self) -> None:
+        """Leaves the options as they are."""
+
+
+@dataclass(frozen=True)
+class RunConfig(SettledConfig):
     """TrainConfig with numbers in place of automatic values, as `train.plan` makes it."""
 
     iterations: int = option(2400, "Optimization steps.", minimum=1)

@@ -97,20 +97,41 @@ def _undo_export(splats: Splats, record: Path) -> Splats:
     return transformed(splats, similarity.inverse())
 
 
-def format_comparison(models: Sequence[ScoredModel], form: str) -> str:
-    """Returns the models, at least one, as text, markdown, csv, latex or json."""
+def format_comparison(
+    models: Sequence[ScoredModel], form: str, *, caption: str = "", label: str = ""
+) -> str:
+    """Returns the models, at least one, as text, markdown, csv, latex or json.
+
+    `caption` and `label` are those of the first table in LaTeX.
+    """
     if form == "json":
         return json.dumps(_record(models), indent=1)
-    scores = {scored.label: scored.score for scored in models}
+    scores, means = {scored.label: scored.score for scored in models}, scene_means(models)
     if form == "csv":
-        return csv_table(scores).rstrip()
+        return csv_table({**scores, **means}).rstrip()
     tables = [table for table in (
-        model_table(scores), difference_table(models), _paper_rows(models)) if table.rows]
+        model_table(scores, means), difference_table(models), _paper_rows(models)) if table.rows]
     if form == "latex":
-        return "\n".join(table.latex() for table in tables).rstrip()
+        first, *others = tables
+        return "\n".join([first.latex(caption, label), *(
+            table.latex() for table in others)]).rstrip()
     if form == "markdown":
         return "\n".join(table.markdown() for table in tables) + "\n" + _NOTE
     return "\n\n".join(table.text(rule=True) for table in tables) + "\n\n" + _NOTE
+
+
+def scene_means(models: Sequence[ScoredModel]) -> dict[str, ModelMetrics]:
+    """Returns the means over scenes by label, of each kind of model that several scenes have.
+
+    There is none of a kind that a scene has twice (the same views), nor of files.
+    """
+    by_kind: dict[str, list[ScoredModel]] = {}
+    for scored in models:
+        by_kind.setdefault(scored.kind, []).append(scored)
+    return {
+        f"mean of {len(group)} scenes, {kind}": ModelMetrics.mean([one.score for one in group])
+        for kind, group in by_kind.items()
+        if kind and len(group) > 1 and len({one.digest for one in group}) == len(group)}
 
 
 def difference_table(models: Sequence[ScoredModel]) -> Table:
@@ -155,6 +176,10 @@ def _record(models: Sequence[ScoredModel]) -> dict[str, Any]:
             "views": [dataclasses.asdict(view) for view in scored.score.views],
             **{key: getattr(scored.score, key) for key in (
                 "gaussians", "bytes", "render_ms", "train_seconds")}} for scored in models],
+        "means": {label: {
+            name: value for name, value in dataclasses.asdict(score).items()
+            if name not in ("views", "seen_psnr_db", "gain_psnr_db")}
+            for label, score in scene_means(models).items()},
         "differences": [{
             "ours": ours.label, "theirs": theirs.label,
             **{key: _difference(ours, theirs, key).to_json() for key in ("psnr_db", "ssim")}}

@@ -62,6 +62,17 @@ class ModelMetrics(JsonRecord):
     views: tuple[ViewScore, ...]
 
     @classmethod
+    def mean(cls, models: Sequence[ModelMetrics]) -> Self:
+        """Returns the means over scenes, each of the same weight; None where one lacks a figure."""
+        def mean(name: str) -> float | None:
+            values = [getattr(model, name) for model in models]
+            return None if None in values else float(np.mean(values))
+
+        scores = {name: mean(name) for name in (*_VIEW_FIELDS, "render_ms", "train_seconds")}
+        counts = {name: round(mean(name) or 0) for name in ("gaussians", "bytes")}
+        return cls(**scores, **counts, views=())  # type: ignore[arg-type]
+
+    @classmethod
     def from_views(
         cls, views: tuple[ViewScore, ...], *, gaussians: int, bytes: int, render_ms: float,
         train_seconds: float | None = None, gain_psnr_db: float | None = None,
@@ -101,6 +112,7 @@ class Metrics(JsonRecord):
     masked_out_test: tuple[str, ...] | None = None  # held-out frames whose masks leave too little
     imported_from: str | None = None  # name of the file of an imported scene
     base_recipe: str | None = None  # REFERENCE where base was trained so; None: not, or unknown
+    protocol: str | None = None  # of `recon train --protocol`, if it was followed up to the scores
     frames: int | None = None  # of ingest; None, as the next two, in files of older versions
     training_views: int | None = None  # None for an imported scene, too
     unregistered: tuple[str, ...] | None = None  # names of all frames without a camera
@@ -118,8 +130,9 @@ class Metrics(JsonRecord):
 
     def label(self, model: str) -> str:
         """Returns the label of a model in tables: 3DGS only where it was trained as 3DGS is."""
-        return self.base_recipe if model == "base" and self.base_recipe else (
+        name = self.base_recipe if model == "base" and self.base_recipe else (
             MODEL_LABELS.get(model, model))
+        return f"{name} (protocol {self.protocol})" if self.protocol else name
 
     @classmethod
     def read(cls, evaluate: Path) -> Self:
@@ -166,6 +179,7 @@ class Table:
     headings: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     title: str = ""
+    means: int = 0  # rows at the end that are means of those above; LaTeX sets them apart
 
     def text(self, *, rule: bool = False) -> str:
         """Returns aligned columns for a terminal; with a line below the headings if `rule`."""
@@ -185,14 +199,31 @@ class Table:
         table = "".join("| " + " | ".join(line) + " |\n" for line in lines)
         return f"### {self.title}\n\n{table}".rstrip() if self.title else table
 
-    def latex(self) -> str:
-        """Returns the table in LaTeX; needs booktabs."""
+    def csv(self) -> str:
+        """Returns the table as CSV, below its title where it has one."""
+        file = io.StringIO()
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([*[[self.title]] * bool(self.title), self.headings, *self.rows])
+        return file.getvalue()
+
+    def latex(self, caption: str = "", label: str = "") -> str:
+        """Returns the table in LaTeX, as a float where it has a caption or label; needs booktabs.
+
+        `caption` and `label` are LaTeX and stay as they are.
+        """
         def line(cells: Sequence[str]) -> str:
             return " & ".join(cell.translate(_TEX) for cell in cells) + r" \\" + "\n"
 
         columns = "l" + "r" * (len(self.headings) - 1)
-        return (f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{line(self.headings)}\\midrule\n"
-                f"{''.join(map(line, self.rows))}\\bottomrule\n\\end{{tabular}}\n")
+        body = len(self.rows) - self.means
+        means = "\\midrule\n" + "".join(map(line, self.rows[body:])) if self.means else ""
+        tabular = (f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{line(self.headings)}\\midrule\n"
+                   f"{''.join(map(line, self.rows[:body]))}{means}"
+                   "\\bottomrule\n\\end{tabular}\n")
+        if not caption and not label:
+            return tabular
+        named = f"\\caption{{{caption}}}\n" * bool(caption) + f"\\label{{{label}}}\n" * bool(label)
+        return f"\\begin{{table}}\n\\centering\n{named}{tabular}\\end{{table}}\n"
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -214,16 +245,21 @@ def or_dash(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-def model_table(models: Mapping[str, ModelMetrics]) -> Table:
-    """Returns the models side by side, by label; LPIPS has a column where one has it."""
-    perceptual = any(model.lpips is not None for model in models.values())
+def model_table(
+    models: Mapping[str, ModelMetrics], means: Mapping[str, ModelMetrics] | None = None
+) -> Table:
+    """Returns the models side by side by label, `means` below; LPIPS has a column where one has it.
+    """
+    rows = {**models, **(means or {})}
+    perceptual = any(model.lpips is not None for model in rows.values())
     headings = ("model", "PSNR dB", "8-bit", "SSIM", "SSIM 0-pad", *["LPIPS"] * perceptual,
                 "Gaussians", "MB", "ms/view", "train s")
     return Table(headings, tuple((
         label, f"{model.psnr_db:.2f}", f"{model.psnr_8bit_db:.2f}", f"{model.ssim:.4f}",
         f"{model.ssim_padded:.4f}", *[or_dash(model.lpips, ".4f")] * perceptual,
         f"{model.gaussians:,}", f"{model.bytes / 1e6:.1f}", f"{model.render_ms:.0f}",
-        or_dash(model.train_seconds, ".0f")) for label, model in models.items()))
+        or_dash(model.train_seconds, ".0f")) for label, model in rows.items()),
+        means=len(means or {}))
 
 
 def view_table(models: Mapping[str, ModelMetrics]) -> Table:

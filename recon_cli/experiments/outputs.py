@@ -47,9 +47,11 @@ class Result:
         return "\n\n".join([self.head + ".", *tables, *self.notes])
 
     def format(self, form: str) -> str:
-        """Returns it as text, markdown, latex or json."""
+        """Returns it as text, markdown, latex, csv (a blank line between tables) or json."""
         if form == "json":
             return json.dumps(self.record, indent=1)
+        if form == "csv":
+            return "\n".join(table.csv() for table in self.tables).rstrip()
         if form == "latex":
             return "\n".join(table.latex() for table in self.tables).rstrip()
         return self.markdown() if form == "markdown" else self.text()

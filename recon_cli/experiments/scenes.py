@@ -119,6 +119,10 @@ class LoadedScene:
         task = self._load_task(self.base)
         return model_parts(choose_parts(task, self.scene, self.ctx, harmonics=True).config)
 
+    def release(self) -> None:
+        """Frees the training images; the next task reads them again."""
+        self.__dict__.pop("_tasks", None)
+
     def task(self, run: TrainingRun) -> Task:
         """Returns the task of a run, without validation views: training uses only what it fits."""
         config = run.config

@@ -19,6 +19,14 @@ from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.evaluation.scores import Table, or_dash
 from recon_cli.experiments.instruments import Host
 from recon_cli.experiments.outputs import Result, add_legend, drawing
+from recon_cli.experiments.paper_tables import (
+    CAUTION,
+    PublishedScores,
+    published_gains,
+    published_scores,
+    table_i,
+    table_ii,
+)
 from recon_cli.experiments.runner import (
     FIGURES,
     ExperimentRequest,
@@ -47,28 +55,36 @@ from recon_cli.workspace.layout import disk_errors, hold_lock
 # The paper compares the first two; the others are `recon train` without and with --prune.
 VARIANTS: tuple[Variant, ...] = (REFERENCE, PAPER, BUDGET, BUDGET_PRUNED)
 BASELINE, DEFAULT = REFERENCE, BUDGET  # the others are compared with these
-PAIRS: tuple[tuple[Variant, Variant], ...] = (
-    *((variant, BASELINE) for variant in VARIANTS if variant is not BASELINE),
-    *((variant, DEFAULT) for variant in VARIANTS if variant not in (BASELINE, DEFAULT)))
 EQUAL_STEPS, EQUAL_SECONDS = COMPARISONS = ("equal steps", "equal seconds")
+
+
+@dataclass(frozen=True)
+class Design:
+    """The variants of a study, and how they are compared."""
+
+    variants: tuple[Variant, ...]
+    comparisons: tuple[str, ...]
+    paper_tables: bool = False  # Tables I and II of the paper, whole, come first
+
+    @property
+    def pairs(self) -> tuple[tuple[Variant, Variant], ...]:
+        """The variants whose differences are shown."""
+        others = [variant for variant in self.variants if variant is not BASELINE]
+        return (*((variant, BASELINE) for variant in others),
+                *((variant, DEFAULT) for variant in others if variant is not DEFAULT))
+
+
+STUDY = Design(VARIANTS, COMPARISONS)
+PAPER_TABLES = Design((REFERENCE, PAPER, BUDGET), (EQUAL_STEPS,), paper_tables=True)
+PAIRS = STUDY.pairs
 MEAN = "all scenes"  # in place of a scene's name: the mean over scenes
 _NEAR = 0.05  # relative: the seconds of a repeated run differ by as much
 
 SCORES = ("psnr_db", "ssim")  # the figures whose differences are shown
+_SUFFIXES = {"latex": "tex", "csv": "csv"}
 _OFFSET = 0.18  # between the lines of two variants, where two scenes are 1 apart
 
 logger = logging.getLogger("recon")
-
-
-PublishedScores = tuple[float, float, float, float]
-# Table I (Replica): PSNR in dB and SSIM of 3DGS, then of the method of the paper
-TABLE_I: dict[str, PublishedScores] = {
-    "office0": (38.45, 0.925, 39.05, 0.934), "office1": (36.97, 0.938, 37.17, 0.954),
-    "office2": (36.39, 0.945, 36.68, 0.962), "office3": (35.85, 0.941, 36.35, 0.958),
-    "office4": (36.54, 0.939, 36.66, 0.941), "room0": (37.26, 0.915, 38.06, 0.923),
-    "room1": (36.28, 0.929, 37.75, 0.935), "room2": (34.98, 0.913, 35.14, 0.927)}
-_CAUTION = ("The paper names neither its frames, sizes, held-out views nor its number of runs: its "
-            "figures and those of this study do not measure the same thing.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +94,7 @@ class StudyRequest(ExperimentRequest):
     iterations: int  # steps of every variant where steps are equal
     out: Path  # folder of records, tables and the workspaces of data sets
     clock: str = "wall"  # or "cpu": which seconds are made equal
+    design: Design = STUDY
 
 
 @dataclass(frozen=True)
@@ -90,6 +107,7 @@ class StudyResult:
     clock: str
     scenes: Mapping[str, SceneRuns]
     digests: Mapping[str, str]  # of the scenes' files
+    design: Design = STUDY
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -132,7 +150,8 @@ class StudyResult:
             "schema": "recon-study", "version": 1, "machine": asdict(self.host),
             "run_on": list(self.machines), "seeds": self.seeds,
             "base": shared_options(self.base), "clock": self.clock,
-            "arms": [variant.record() | {"label": variant.label} for variant in VARIANTS],
+            "arms": [variant.record() | {"label": variant.label}
+                     for variant in self.design.variants],
             "scenes": {name: {
                 **scene.size_record(), "digest": self.digests[name], "parts": self.parts(name),
             } for name, scene in self.scenes.items()},
@@ -149,9 +168,10 @@ class StudyResult:
             "arms": {variant.name: {
                 figure: {"by_seed": self.values(row, comparison, variant, figure),
                          **asdict(self.spread(row, comparison, variant, figure))}
-                for figure in FIGURES} for variant in VARIANTS},
+                for figure in FIGURES} for variant in self.design.variants},
             "differences": {f"{pair[0].name} - {pair[1].name}": {
-                figure: interval(pair, figure) for figure in SCORES} for pair in PAIRS}}
+                figure: interval(pair, figure) for figure in SCORES}
+                for pair in self.design.pairs}}
 
 
 def run(request: StudyRequest, progress: Progress) -> Result:
@@ -173,10 +193,12 @@ def run(request: StudyRequest, progress: Progress) -> Result:
         studied = StudyResult(
             host, request.seeds, request.base, request.clock,
             {loaded.folders.name: study.run_scene(loaded) for loaded in scenes},
-            {loaded.folders.name: loaded.folders.digest for loaded in scenes})
+            {loaded.folders.name: loaded.folders.digest for loaded in scenes}, request.design)
         result = Result(studied.record(), head(studied), tables(studied), notes(studied),
                         lambda path: draw(studied, path))
         result.save(out, "study")
+        for form in ("latex", "csv") if request.design.paper_tables else ():
+            atomic.write_text(out / f"study.{_SUFFIXES[form]}", result.format(form) + "\n")
         atomic.write_text(out / "study.md", f"# The paper's experiment\n\n{result.markdown()}\n")
     return result
 
@@ -207,21 +229,25 @@ class Study:
     ) -> None:
         self._request, self._records, self._progress = request, records, progress
         self._runner = Runner(request.base, progress, machine, records)
+        self._variants = request.design.variants
 
     def announcement(self, scenes: list[LoadedScene]) -> str:
         """Returns a sentence about how many runs are missing and how long they will take."""
         seconds, missing = 0.0, 0
         seeds, iterations = self._request.seeds, self._request.iterations
         for loaded in scenes:
-            counts = {variant.name: self._count_missing(loaded, variant) for variant in VARIANTS}
+            counts = {variant.name: self._count_missing(loaded, variant)
+                      for variant in self._variants}
             missing += sum(counts.values())
             if any(counts.values()):
                 costs = {name: iterations * step for name, step in
-                         self._runner.pilot_seconds(loaded, VARIANTS).items()}
+                         self._runner.pilot_seconds(loaded, self._variants).items()}
+                loaded.release()
                 seconds += sum(
                     costs[name] * min(count, seeds) + max(costs.values()) * max(0, count - seeds)
                     for name, count in counts.items())
-        recorded = len(scenes) * 2 * len(VARIANTS) * seeds - missing
+        recorded = len(scenes) * len(self._request.design.comparisons) * len(
+            self._variants) * seeds - missing
         if not missing:
             return f"all {recorded} runs are kept from before"
         return (f"about {missing} runs are to be made, {recorded} are kept from before; about "
@@ -229,8 +255,10 @@ class Study:
 
     def _count_missing(self, loaded: LoadedScene, variant: Variant) -> int:
         """Returns how many runs of a variant are missing; those of unknown steps are, too."""
-        fixed = self._records.find(self._steps_key(loaded))
-        steps = [{variant.name: self._request.iterations}, fixed and fixed["steps"]]
+        steps: list[Mapping[str, int] | None] = [{variant.name: self._request.iterations}]
+        if EQUAL_SECONDS in self._request.design.comparisons:
+            fixed = self._records.find(self._steps_key(loaded))
+            steps.append(fixed and fixed["steps"])
         return sum(
             by_variant is None or self._runner.find_record(loaded, TrainingRun(
                 variant, self._request.base, by_variant[variant.name], seed)) is None
@@ -238,15 +266,18 @@ class Study:
 
     def run_scene(self, loaded: LoadedScene) -> SceneRuns:
         """Returns all runs on a scene; the missing ones are made now."""
-        steps = dict.fromkeys((variant.name for variant in VARIANTS), self._request.iterations)
-        equal = self._run_all(loaded, EQUAL_STEPS, steps)
-        runs = {EQUAL_STEPS: equal,
-                EQUAL_SECONDS: self._run_all(loaded, EQUAL_SECONDS, self._steps(loaded, equal))}
+        steps = dict.fromkeys(
+            (variant.name for variant in self._variants), self._request.iterations)
+        runs = {EQUAL_STEPS: self._run_all(loaded, EQUAL_STEPS, steps)}
+        if EQUAL_SECONDS in self._request.design.comparisons:
+            runs[EQUAL_SECONDS] = self._run_all(
+                loaded, EQUAL_SECONDS, self._steps(loaded, runs[EQUAL_STEPS]))
+        loaded.release()
         return SceneRuns.from_loaded(loaded, runs)
 
     def _run_all(self, loaded: LoadedScene, comparison: str, steps: Mapping[str, int]) -> Runs:
         return self._runner.run_all(
-            loaded, VARIANTS, self._request.seeds, steps,
+            loaded, self._variants, self._request.seeds, steps,
             label=f"{loaded.folders.name}, {comparison}")
 
     def _steps(self, loaded: LoadedScene, equal: Runs) -> Mapping[str, int]:
@@ -259,7 +290,7 @@ class Study:
         steps = equal_seconds(count, seconds)
         label = f"{loaded.folders.name}, finding {EQUAL_SECONDS}"
         with self._progress.bar(label, sum(steps.values()), unit="step") as bar:
-            for name, variant in zip(steps, VARIANTS, strict=True):
+            for name, variant in zip(steps, self._variants, strict=True):
                 guess = TrainingRun(variant, self._request.base, steps[name], 0)
                 record = self._runner.find_record(loaded, guess) or self._runner.make(
                     loaded, guess, (), bar.advance)
@@ -276,16 +307,35 @@ class Study:
         """Returns the key of the steps at equal seconds, whatever the number of seeds."""
         request = self._request
         first = [key_of(loaded, TrainingRun(variant, request.base, request.iterations, 0))
-                 for variant in VARIANTS]
+                 for variant in self._variants]
         return sha256_json({"steps of": first, "clock": request.clock})
 
 
 def tables(result: StudyResult) -> list[Table]:
     """Returns scores and differences of each comparison, and the paper's scores if they apply."""
     found = [make(result, comparison)
-             for comparison in COMPARISONS for make in (scores, differences)]
+             for comparison in result.design.comparisons for make in (scores, differences)]
+    if result.design.paper_tables:
+        return [*paper_tables(result), *found]
     beside = beside_the_paper(result)
     return found if beside is None else [*found, beside]
+
+
+def paper_tables(result: StudyResult) -> list[Table]:
+    """Returns Tables I and II with the printed scores beside those of this study."""
+    variants = {variant.label: variant for variant in result.design.variants}
+
+    def here(scene: str, method: str) -> tuple[float, float] | None:
+        row = next((name for name in result.scenes if name.lower() == scene.lower()), None)
+        if row is None:
+            return None
+        psnr_db, ssim = (result.spread(row, EQUAL_STEPS, variants[method], figure).mean
+                         for figure in SCORES)
+        return psnr_db, ssim
+
+    own = [scene for scene in result.scenes if published_scores(scene) is None]
+    return [table_i(tuple(variants), here, "Table I: Replica, printed and here"),
+            table_ii(own, tuple(variants), here, "Table II: own captures, printed and here")]
 
 
 def head(result: StudyResult) -> str:
@@ -312,7 +362,7 @@ def scores(result: StudyResult, comparison: str) -> Table:
 
     return Table(header, [
         (f"{row}, {variant.label}", *cells(row, variant))
-        for row in result.rows for variant in VARIANTS], f"Scores at {comparison}")
+        for row in result.rows for variant in result.design.variants], f"Scores at {comparison}")
 
 
 def differences(result: StudyResult, comparison: str) -> Table:
@@ -328,7 +378,7 @@ def differences(result: StudyResult, comparison: str) -> Table:
         label for name in SCORES for label in (FIGURES[name].label, "95% from", "to", "so it is")))
     return Table(header, [
         (f"{row}, {pair[0].label} - {pair[1].label}", *cells(row, pair))
-        for row in result.rows for pair in PAIRS], f"Differences at {comparison}")
+        for row in result.rows for pair in result.design.pairs], f"Differences at {comparison}")
 
 
 def beside_the_paper(result: StudyResult) -> Table | None:
@@ -357,30 +407,21 @@ def _row_beside_the_paper(
         *pair(paper[0] - base[0], paper[1] - base[1], sign="+"))
 
 
-def published_scores(scene: str) -> PublishedScores | None:
-    """Returns the paper's scores of a scene of that name, None where it has none."""
-    return TABLE_I.get(scene.lower())
-
-
-def published_gains(published: PublishedScores) -> dict[str, float]:
-    """Returns the gains that the paper reports, by figure."""
-    return {"psnr_db": published[2] - published[0], "ssim": published[3] - published[1]}
-
-
 def notes(result: StudyResult) -> list[str]:
     """Returns how the figures are to be read."""
     def list_parts(scene: str) -> str:  # variants of the same parts together
         labels: dict[str, list[str]] = {}
-        for variant in VARIANTS:
+        for variant in result.design.variants:
             labels.setdefault(result.parts(scene)[variant.name], []).append(variant.label)
         return ", ".join(f"{parts} ({' and '.join(names)})" for parts, names in labels.items())
 
-    clock = {"wall": "on the wall", "cpu": "of the CPU"}[result.clock]
-    count = len(result.rows) * len(PAIRS) * len(SCORES) * len(COMPARISONS)
-    lines = [
+    design, clock = result.design, {"wall": "on the wall", "cpu": "of the CPU"}[result.clock]
+    count = len(result.rows) * len(design.pairs) * len(SCORES) * len(design.comparisons)
+    lines = [*[
         f"Equal seconds: each arm takes as many steps as fit into the seconds {clock} that the "
         "slowest arm's take at equal steps, as measured first; the steps are "
-        "then fixed. Seconds are of training, pruning included, without scoring.",
+        "then fixed. Seconds are of training, pruning included, without scoring."
+        ] * (EQUAL_SECONDS in design.comparisons),
         "Each arm is trained on " + "; ".join(
             f"{scene}: {list_parts(scene)}" for scene in result.scenes)
         + ". The trials that decide so are not timed.",
@@ -389,8 +430,8 @@ def notes(result: StudyResult) -> list[str]:
         f"{max(1, round(0.05 * count))} would leave out 0 by chance if no arm differed.",
         f"PSNR: {PSNR_CONVENTION}. SSIM: {SSIM_CONVENTION}. Scored on held-out test views, which "
         "nothing was tuned on."]
-    if beside_the_paper(result) is not None:
-        lines.insert(0, _CAUTION)
+    if design.paper_tables or beside_the_paper(result) is not None:
+        lines.insert(0, CAUTION)
     if result.seeds < 5:
         lines.append(f"{result.seeds} seeds are few: a claim needs 5.")
     if len(result.machines) > 1:
@@ -401,9 +442,10 @@ def notes(result: StudyResult) -> list[str]:
 def draw(result: StudyResult, path: Path) -> None:
     """Draws means and intervals into a .png or .svg; a cross is the gain in the paper."""
     with drawing(path, 13, 2 + 1.4 * len(result.rows)) as figure:
-        panels = figure.subplots(len(SCORES), len(COMPARISONS), squeeze=False, sharey=True)
+        comparisons = result.design.comparisons
+        panels = figure.subplots(len(SCORES), len(comparisons), squeeze=False, sharey=True)
         for line, name in zip(panels, SCORES, strict=True):
-            for axes, comparison in zip(line, COMPARISONS, strict=True):
+            for axes, comparison in zip(line, comparisons, strict=True):
                 _draw_panel(axes, result, comparison, name)
                 axes.set(xlabel=f"{FIGURES[name].label} against 3DGS", title=comparison)
         add_legend(figure, panels[0][0])
@@ -411,7 +453,8 @@ def draw(result: StudyResult, path: Path) -> None:
 
 
 def _draw_panel(axes: Any, result: StudyResult, comparison: str, figure: str) -> None:
-    for number, variant in enumerate(variant for variant in VARIANTS if variant is not BASELINE):
+    others = [variant for variant in result.design.variants if variant is not BASELINE]
+    for number, variant in enumerate(others):
         intervals = [result.difference(row, comparison, (variant, BASELINE), figure)
                      for row in result.rows]
         axes.errorbar(

@@ -136,10 +136,13 @@ def _obstacles(
     workspace: Workspace, row: Stage, key: ResultKey, finished: Manifest
 ) -> list[str]:
     """Returns in words why a run of `key` does not prolong a finished one."""
-    reasons = differences(_without_length(finished.key), _without_length(key), section=row.name)
+    reasons = differences(_without_length(finished.key), _without_length(key), section=row.name,
+                          late=row.config.late_fields())
     reasons += find_changed_outputs(workspace.folder(row.name), finished, row.volatile)
     if finished.run.summary.get("blocks"):
         reasons.append("the finished run was trained in blocks")
+    if protocol := key.config.get("protocol"):
+        reasons.append(f"a run of the protocol {protocol} starts from the points of sfm")
     if not _is_longer(key, finished):
         reasons.append(f"{row.name}.iterations is not above the "
                        f"{finished.run.summary.get('planned_iterations', 0):,} of the finished run")

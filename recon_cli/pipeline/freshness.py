@@ -171,7 +171,7 @@ class WorkspaceCheck:
         expected = self._current_key(row, config, manifest.key, sources)
         reasons += differences(
             manifest.key, expected, section=layers.section_of(row.config),
-            without=row.config.per_file_fields())
+            without=row.config.per_file_fields(), late=row.config.late_fields())
         reasons += find_changed_outputs(
             self._workspace.folder(row.name), manifest, row.volatile, row.states)
         try:  # another version may have written another record

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.config.protocols import PROTOCOLS, SPLIT_WORDS
 from recon_cli.config.stages import EvaluateConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import list_names
@@ -76,6 +77,7 @@ class _Evaluation:
     held_out: Sequence[ReferenceView]
     training_views: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
     ctx: StageContext
+    protocol: str | None = None  # that training and scores follow
 
     @property
     def gains(self) -> bool:
@@ -137,6 +139,8 @@ class _Evaluation:
                 f"LPIPS: {f'not measured, {lacking}' if lacking else LPIPS_CONVENTION}\n")
         if masked:
             note += f"Masks on {masked} of {len(self.held_out)} views: {MASK_CONVENTION}\n"
+        if self.protocol:
+            note += f"Protocol {self.protocol}: {PROTOCOLS[self.protocol].words}; {SPLIT_WORDS}\n"
         return note + "".join(
             f"{text}\n" for text in (self.import_record.warnings() if self.import_record else ()))
 
@@ -185,9 +189,12 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
             evenly_spread(split, _SEEN_VIEWS), size, threads=ctx.threads))}
     folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
+    record = ImportRecord.read(inputs.folders["train"])
+    followed = record is None and size == train_config.max_size
     return _Evaluation(
-        out, folders, train_config, ImportRecord.read(inputs.folders["train"]),
-        read_frame_list(inputs.folders["ingest"]).frames, scene, held_out, training_views, ctx)
+        out, folders, train_config, record,
+        read_frame_list(inputs.folders["ingest"]).frames, scene, held_out, training_views, ctx,
+        train_config.protocol if followed else None)
 
 
 def _save_pictures(out: Path, model: str, view: ReferenceView, image: NDArray[np.float32]) -> None:
@@ -226,7 +233,7 @@ def _write(
         imported_from=evaluation.import_record.file if evaluation.import_record else None,
         base_recipe=REFERENCE if evaluation.config.is_reference and not (
             evaluation.import_record) else None,
-        **evaluation.coverage())
+        protocol=evaluation.protocol, **evaluation.coverage())
     write_json(out / Metrics.FILE, metrics.to_json())
     by_label = {metrics.label(name): model for name, model in models.items()}
     note = evaluation.note(lacking)

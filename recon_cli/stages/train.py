@@ -19,13 +19,20 @@ from recon_cli.train import blocks
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.merge_blocks import merge_blocks
 from recon_cli.train.one_model import fit_scene
+from recon_cli.train.protocol import fit_protocol
+from recon_cli.workspace.records import read_frame_list
 from recon_cli.workspace.summaries import TrainSummary
 
 
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
     """Fits Gaussians to the training views and returns how far it came."""
     scene = load_scene(inputs.folders, validation=config.validation)
+    config = fit_protocol(config, scene, read_frame_list(inputs.folders["ingest"]).frames)
     model = None if inputs.continues is None else FinishedModel.read(inputs.continues)
+    if model is not None and config.protocol is not None:
+        raise ConfigError(
+            f"The protocol {config.protocol} starts from the points of sfm, not from a scene.",
+            hint="Leave out --from-import or --protocol.")
     count = _count_blocks(config, scene, model, ctx)
     if count > 1:
         return _train_in_blocks(config, count, scene, inputs, out, ctx)

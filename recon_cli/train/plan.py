@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from recon_cli.config.protocols import follow
 from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig, TrainConfig
 from recon_cli.context import StageContext
 from recon_cli.scene.scene import Scene
@@ -51,6 +52,7 @@ _FULL_AT = 2400  # steps after which there may be a Gaussian for each pixel with
 _VIEWS_EACH = 8  # views that must show a Gaussian, about, to tell where it is
 _FIRST = 0.5  # of the cap, at the start
 _FEWEST = 5000
+_UNLIMITED = 0.5  # of the room in memory; a run that resumes must find the same room again
 # Real Gaussians cover more tiles than timed ones: ten runs took -1 to 17% longer, 9% on the mean
 _LONGER = 1.09
 _ROUND = 100  # counts are multiples of this
@@ -116,7 +118,7 @@ def make_plan(
             most = max(most, model.gaussians)
         config = _fill_in(asked, iterations, most, first_config(asked).max_size)
         first = first_count(config, facts.points) if model is None else model.gaussians
-        schedule = make_schedule(config, continues_at)
+        schedule = make_schedule(_likely(config, facts), continues_at)
         return TrainPlan(
             iterations=iterations, max_gaussians=most, max_size=config.max_size,
             first_gaussians=first, detail=facts.detail,
@@ -140,7 +142,27 @@ def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:
     """
     if asked.max_gaussians is not None:
         return asked.max_gaussians
+    if _is_unlimited(asked):
+        return max(MIN_GAUSSIANS, int(_UNLIMITED * facts.room))
     return min(useful_cap(facts, iterations), max(MIN_GAUSSIANS, facts.room))
+
+
+def _is_unlimited(config: TrainConfig) -> bool:
+    """Returns whether only memory limits the count, as a protocol may ask for."""
+    protocol = follow(config.protocol)
+    return protocol is not None and not protocol.limits_count
+
+
+def _likely(config: RunConfig, facts: Facts) -> RunConfig:
+    """Returns the options with the count that a run is likely to end with, to tell its time.
+
+    Where memory is the limit it ends about where `cap` would: on bonsai, after 30,000 steps of the
+    reference, at TODO.
+    """
+    if not _is_unlimited(config):
+        return config
+    likely = max(MIN_GAUSSIANS, facts.points, useful_cap(facts, config.iterations))
+    return dataclasses.replace(config, max_gaussians=min(config.max_gaussians, likely))
 
 
 def first_count(config: RunConfig, points: int) -> int:

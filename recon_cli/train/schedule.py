@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from recon_cli.config.protocols import STEPS, follow
 from recon_cli.config.stages import RunConfig
 
 _LAST_FIFTH = 0.8  # where a recipe names no final phase of its own
@@ -84,7 +85,6 @@ BUDGET = Recipe(
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 
-_REFERENCE = 30_000  # iterations of INRIA's default run
 _RESET_EVERY = 3000
 _RESET_FLOOR = 1000  # steps; after a reset at a rate of .05 a picture needs some hundred to return
 # Steps that the falling rates must have: fewer settle nothing, and only cost what the fall takes.
@@ -106,9 +106,15 @@ class Schedule:
             object.__setattr__(self, "recipe", RECIPES[self.config.densify])
 
     @property
+    def length(self) -> int:
+        """Steps that intervals and shares count by: the run's, or those that a protocol names."""
+        protocol = follow(self.config.protocol)
+        return STEPS if protocol and protocol.whole_schedule else self.config.iterations
+
+    @property
     def steps(self) -> int:
-        """Steps from the first to the last."""
-        return self.config.iterations - self.first
+        """Steps from the first to the last of that length."""
+        return self.length - self.first
 
     def share(self, iteration: int) -> float:
         """Returns how much of the run is done after a step, 0 to 1."""
@@ -121,12 +127,13 @@ class Schedule:
     @property
     def reset_every(self) -> int:
         """Steps from one opacity reset to the next."""
-        return max(_RESET_FLOOR, round(_RESET_EVERY * self.config.iterations / _REFERENCE))
+        return max(_RESET_FLOOR, round(_RESET_EVERY * self.length / STEPS))
 
     @property
     def mid(self) -> int:
         """The iteration whose state is kept for pruning."""
-        return self.first + max(1, round(self.config.mid * self.steps))
+        mid = self.first + max(1, round(self.config.mid * self.steps))
+        return mid if self.length == self.config.iterations else min(mid, self.config.iterations)
 
     def level(self, iteration: int) -> int:
         """Returns the factor by which images are reduced in this step."""
@@ -137,7 +144,7 @@ class Schedule:
         """Returns the degree in use; the reference raises it every 1,000 steps or sooner."""
         before = iteration - 1
         if self.recipe.resets:
-            every = max(1, min(_SH_EVERY, self.config.iterations // 10))
+            every = max(1, min(_SH_EVERY, self.length // 10))
             return min(self.config.sh_degree, before // every)
         return min(self.config.sh_degree,
                    sum(before >= share * self.config.iterations for share in self.recipe.sh_at))

@@ -167,11 +167,12 @@ class PartialRun:
 
 
 def differences(
-    old: ResultKey, new: ResultKey, *, section: str, without: Collection[str] = ()
+    old: ResultKey, new: ResultKey, *, section: str, without: Collection[str] = (),
+    late: Collection[str] = (),
 ) -> list[str]:
     """Returns in words how the key of a result differs from the one that a run would have now.
 
-    Options `without` are not compared.
+    Options `without` are not compared; those that came `late` may be missing, for None.
     """
     reasons = []
     if old.version != new.version:
@@ -180,9 +181,9 @@ def differences(
         before, after = old.config.get(name), new.config.get(name)
         if name in without:
             continue
-        if name not in old.config:
+        if name not in old.config and name not in late:
             reasons.append(f"option {section}.{name} is new")
-        elif name not in new.config:
+        elif name not in new.config and name not in late:
             reasons.append(f"option {section}.{name} no longer exists")
         elif before != after:
             reasons.append(

@@ -93,6 +93,20 @@ def test_tables_name_a_base_model_3dgs_only_where_it_was_trained_so(recipe, labe
     assert Metrics.from_json(metrics.to_json()).base_recipe == recipe
 
 
+def test_tables_name_the_protocol_that_was_followed():
+    named = dict(zip(("base", "pruned"), scores().values(), strict=True))
+    metrics = Metrics(
+        models=named, psnr_convention="", psnr_8bit_convention="", ssim_convention="",
+        ssim_padded_convention="", lpips_convention="", truth_digest="", width=1, height=1,
+        test_views=2, unregistered_test=(), base_recipe=REFERENCE, protocol="3dgs")
+    assert [metrics.label(name) for name in metrics.models] == [
+        "3DGS (protocol 3dgs)", "compact (protocol 3dgs)"]
+    record = metrics.to_json()
+    assert Metrics.from_json(record).protocol == "3dgs"
+    del record["protocol"]  # as before there were protocols
+    assert Metrics.from_json(record).protocol is None
+
+
 def test_a_table_says_the_same_in_every_form():
     table = Table(("a_b", "50%"), (("x", "1"), ("yy", "22")))
     assert table.text() == "a_b  50%\nx      1\nyy    22"

@@ -7,6 +7,7 @@ import pytest
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments import study
 from recon_cli.experiments.instruments import Host
+from recon_cli.experiments.paper_tables import TABLE_I, published_scores
 from recon_cli.experiments.runner import CurvePoint, Record, SceneRuns
 from recon_cli.experiments.study import (
     COMPARISONS,
@@ -14,10 +15,9 @@ from recon_cli.experiments.study import (
     EQUAL_STEPS,
     MEAN,
     PAIRS,
-    TABLE_I,
+    PAPER_TABLES,
     VARIANTS,
     StudyResult,
-    published_scores,
 )
 
 pytestmark = pytest.mark.floors
@@ -135,3 +135,29 @@ def test_the_picture_is_drawn(tmp_path):
     study.draw(result(), tmp_path / "study.svg")
     assert (tmp_path / "study.svg").stat().st_size > 5000
     assert list(tmp_path.iterdir()) == [tmp_path / "study.svg"]
+
+
+def test_the_tables_of_the_paper_are_whole_whatever_was_run():
+    def equal_steps(db):
+        arms = scene(db, (0.0, -0.5, 1.0, 0.0)).runs[EQUAL_STEPS]
+        return {EQUAL_STEPS: {arm.name: arms[arm.name] for arm in PAPER_TABLES.variants}}
+
+    runs = {"Room0": equal_steps(30.0), "home": equal_steps(20.0)}
+    scenes = {name: SceneRuns(4, 600, 340, comparisons) for name, comparisons in runs.items()}
+    studied = StudyResult(HOST, 3, RunConfig(), "wall", scenes, dict.fromkeys(scenes, "digest"),
+                          PAPER_TABLES)
+    first, second = study.paper_tables(studied)
+    assert [row[0] for row in first.rows] == [*TABLE_I, "mean of 8", "mean of 1 run"]
+    assert rows(first)["room0"] == (
+        "37.26", "0.915", "38.06", "0.923", "30.00", "0.600", "29.50", "0.590", "31.00", "0.620")
+    assert rows(first)["room1"][:4] == ("36.28", "0.929", "37.75", "0.935")
+    assert set(rows(first)["room1"][4:]) == {"-"}
+    assert rows(first)["mean of 8"][:4] == ("36.59", "0.931", "37.11", "0.942")
+    assert rows(first)["mean of 1 run"] == rows(first)["room0"]
+    assert first.means == 2
+    assert rows(second)["home"][4:] == ("20.00", "0.400", "19.50", "0.390", "21.00", "0.420")
+    assert rows(second)["the paper's capture"][:4] == ("30.41", "0.879", "31.89", "0.897")
+    assert study.tables(studied)[:2] == [first, second]
+    assert "Equal seconds" not in notes(studied)
+    assert "do not measure the same thing" in notes(studied)
+    json.dumps(studied.record(), allow_nan=False)

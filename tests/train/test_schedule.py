@@ -32,6 +32,19 @@ def test_the_degree_is_capped_by_the_option():
     assert plan.sh_degree(100) == 1
 
 
+def test_fewer_steps_of_the_protocol_are_the_first_of_its_30000():
+    whole = Schedule(RunConfig(densify="reference", protocol="3dgs", iterations=30_000))
+    assert whole == Schedule(whole.config)
+    plain = Schedule(RunConfig(densify="reference", iterations=30_000))
+    part = Schedule(RunConfig(densify="reference", protocol="3dgs", iterations=7000))
+    for at in (1, 500, 3000, 3001, 6999, 7000):
+        for name in ("resets", "densifies", "gathers", "sh_degree", "means_rate", "level",
+                     "deletes_large", "rate_factor"):
+            assert getattr(part, name)(at) == getattr(plain, name)(at), (name, at)
+    assert part.mid == 7000
+    assert whole.mid == plain.mid == 18_000
+
+
 def test_a_run_of_one_step_has_a_plan():
     plan = Schedule(RunConfig(densify="reference", iterations=1))
     assert plan.mid == 1
