@@ -71,6 +71,8 @@ HOMES = {
     "ray": {"jobs"},
     "pycolmap": {"io"},
     "trimesh": {"io"},
+    "OpenEXR": {"io"},
+    "lzfse": {"datasets"},
 }
 
 
