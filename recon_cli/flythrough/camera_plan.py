@@ -13,6 +13,7 @@ import numpy as np
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.export.synthetic_cameras import CAMERAS_AROUND
 from recon_cli.flythrough.camera_path import CameraPath, read_camera_path
+from recon_cli.flythrough.panorama import WIDTH, panorama_camera
 from recon_cli.flythrough.request import (
     FPS,
     ORBIT,
@@ -42,7 +43,7 @@ class CameraPlan:
 
 
 def plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
-    """Returns the requested cameras.
+    """Returns the requested cameras; those of panoramas are level, and stand where they do.
 
     StageError if views are requested and there are none, ConfigError for a size or name that cannot
     be used, FormatError for the file of a path.
@@ -51,6 +52,17 @@ def plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
         raise StageError(
             "The scene was imported without views, so there are no cameras of its own to render.",
             hint=f"Give --path {ORBIT}, or --path FILE.json with cameras.")
+    plan = _plan_cameras(request, trained)
+    if not request.panorama:
+        return plan
+    width, _ = frame_size(WIDTH, WIDTH // 2, request)
+    up = trained.up()
+    return CameraPlan(f"{plan.name}_panorama", {
+        name: panorama_camera(camera.viewmat, up, 2 * (width // 2))
+        for name, camera in plan.cameras.items()}, plan.path)
+
+
+def _plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
     if request.views:
         views = _select_views(request.views, trained.scene)
         cameras = {
