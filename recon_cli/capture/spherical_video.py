@@ -23,8 +23,7 @@ _STEREO = re.compile(rb"st3d.{4}[\x01\x02]|GSpherical:StereoMode>\s*(?:top|left)
 _LOOKED_AT, _EVERY, _LEAST = 5, 40, 3
 # What cameras with two fisheye lenses write, and who stitches that.
 _STITCHERS = {
-    ".insv": "Insta360 Studio", ".360": "GoPro Player", ".osv": "DJI Studio",
-    ".insp": "Insta360 Studio"}
+    ".insv": "Insta360 Studio", ".360": "GoPro Player", ".osv": "DJI Studio"}
 
 
 def refuse_unstitched(path: Path) -> None:
