@@ -27,7 +27,7 @@ from recon_cli.io.images import fit_camera, fit_size
 from recon_cli.machine import free_memory_bytes
 from recon_cli.scene.camera import MAX_SIDE, Camera
 from recon_cli.scene.camera_paths import find_look_at, orbit_path, smooth_path, tour_path
-from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.scene import Scene, View, views_ahead
 
 # Of a frame with all outputs, from 1200x680 to 3000x1700 pixels: 55 with numba, 93 with torch.
 _BYTES_PER_PIXEL = 100
@@ -81,7 +81,7 @@ def _plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
 def _make_path(request: RenderRequest, trained: TrainedScene) -> CameraPath:
     """Returns the path through or around the training cameras, with their lens and size."""
     scene, count = trained.scene, request.frames()
-    cameras = [view.camera for view in scene.train]
+    cameras = [view.camera for view in views_ahead(scene.train)]
     if not trained.has_views:
         cameras = cameras[:CAMERAS_AROUND]  # the synthetic cameras after these are in the middle
     viewmats = np.stack([camera.viewmat for camera in cameras])

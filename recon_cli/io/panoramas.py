@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import PurePath
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.faces import CUBE, nearest_face, panorama_rays
+from recon_cli.scene.faces import CUBE, face_order, nearest_face, panorama_rays
 
 
 def stitch_faces(
@@ -54,8 +53,10 @@ def panorama_axes(name: str, camera: Camera) -> NDArray[np.float64] | None:  # [
 
     None where the name is not that of a face of a cube.
     """
-    face = next((face for face in CUBE if PurePath(name).stem.endswith(f"_{face.name}")), None)
-    return None if face is None else np.asarray(face.rotation.T @ camera.viewmat[:3, :3])
+    place = face_order(name)
+    if place == len(CUBE):
+        return None
+    return np.asarray(CUBE[place].rotation.T @ camera.viewmat[:3, :3])
 
 
 def panorama_size(camera: Camera) -> tuple[int, int]:

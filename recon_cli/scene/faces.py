@@ -52,6 +52,13 @@ def view_name(frame: str, face: Face) -> str:
     return f"{path.stem}_{face.name}{path.suffix}"
 
 
+def face_order(view: str) -> int:
+    """Returns the place of a face of a cube by the name of its view; behind all for other names."""
+    stem = PurePath(view).stem
+    return next((place for place, face in enumerate(CUBE) if stem.endswith(f"_{face.name}")),
+                len(CUBE))
+
+
 def face_size(radian_px: float, field_deg: float = FIELD_DEG) -> tuple[int, float]:
     """Returns (side, focal length) in pixels of a face, for the pixels of a radian of the picture.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.cells import Cell
+from recon_cli.scene.faces import face_order
 
 _REACH = 20.0  # extents; a room reaches some
 _LEAST_EXTENT = 0.05  # of the median distance of the points; a step aside in a room
@@ -78,6 +79,19 @@ class Scene:
         nearest = np.min(np.linalg.norm(
             self.points[:: max(1, len(self.points) // _SAMPLES), None] - centers, axis=2), axis=1)
         return float(np.median(nearest))
+
+
+def views_ahead(views: Sequence[View]) -> tuple[View, ...]:
+    """Returns the views that show the way of the camera: of several faces the one that looks ahead.
+
+    That is the first in the order of `scene.faces` of those that are there.
+    """
+    by_frame: dict[str, list[View]] = {}
+    for view in views:
+        by_frame.setdefault(view.frame, []).append(view)
+    ahead = {min(each, key=lambda view: face_order(view.name)).name if len(each) > 1
+             else each[0].name for each in by_frame.values()}
+    return tuple(view for view in views if view.name in ahead)
 
 
 def split_views(

@@ -29,6 +29,9 @@ STRONG, CONTRAST, USUAL = 0.0133, 0.0067, 1000
 # leaves this share of the features that are wanted at most: these are the coarsest, and found in a
 # quarter of the time.
 LEAST_SIZE, ENOUGH_FEATURES = 800, 0.5
+# Panoramas from which on each has as many keypoints as a photo; the pairs of fewer take no longer
+# to match with more, up to so many times as many.
+MANY_PANORAMAS, MOST_FEATURES = 30, 3.0
 DESCRIPTOR_SCALE = 512.0  # of COLMAP's descriptors, which are the square roots of Lowe's (RootSIFT)
 
 
@@ -98,10 +101,17 @@ def find_on_faces(
         tables.append(np.column_stack([panorama_pixels(rays, width, height), shape]))
         descriptors.append(rows)
     table, lowe = np.concatenate(tables), np.concatenate(descriptors)
-    coarsest = np.argsort(-table[:, 2], kind="stable")[:job.max_features]
+    coarsest = np.argsort(-table[:, 2], kind="stable")[:_count_in_panorama(job)]
     xy, sizes, angles = table[coarsest, :2], table[coarsest, 2], table[coarsest, 3]
     return _keypoints(xy, sizes * np.cos(angles), sizes * np.sin(angles)), _root_sift(
         lowe[coarsest])
+
+
+def _count_in_panorama(job: MappingJob) -> int:
+    """Returns the most keypoints of a panorama: more where there are few, which stand far apart."""
+    count = len(job.panoramas)
+    share = MANY_PANORAMAS * (MANY_PANORAMAS - 1) / max(1, count * (count - 1))
+    return round(job.max_features * min(max(1.0, share), MOST_FEATURES))
 
 
 def _find(job: MappingJob, name: str) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

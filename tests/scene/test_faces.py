@@ -1,5 +1,7 @@
 """Faces of a panorama: where a direction lies is known in closed form."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from recon_cli.scene.faces import (
     solid_angles,
     view_name,
 )
+from recon_cli.scene.scene import View, views_ahead
 
 WIDTH, HEIGHT = 1536, 768
 AXES = {"front": (0, 0, 1), "right": (1, 0, 0), "back": (0, 0, -1), "left": (-1, 0, 0),
@@ -95,3 +98,14 @@ def test_a_face_is_as_fine_as_the_panorama():
 
 def test_a_view_is_named_after_its_frame_and_face():
     assert view_name("pano000001.png", CUBE[2]) == "pano000001_back.png"
+
+
+def test_of_the_faces_of_a_frame_one_looks_ahead():
+    def view(name, frame=None):
+        return View(name, cube()[0], Path(name), Path(name), face_of=frame)
+
+    faces = [view(view_name(f"{k}.png", face), f"{k}.png") for k in (0, 1) for face in CUBE]
+    photos = [view("2.png"), view("3_back.png")]
+    assert [each.name for each in views_ahead([*faces, *photos])] == [
+        "0_front.png", "1_front.png", "2.png", "3_back.png"]
+    assert [each.name for each in views_ahead(faces[1:3])] == ["0_right.png"]
