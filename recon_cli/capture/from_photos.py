@@ -24,13 +24,15 @@ from recon_cli.capture.images import WHITE, Photo, describe_white, find_white, r
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.mask_files import mask_folders
 from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
+from recon_cli.capture.panorama_masks import hide_carried
+from recon_cli.capture.panoramas import fill_sphere
 from recon_cli.capture.photo_sequence import PhotoSequence, find_odd, find_sequence
 from recon_cli.capture.photo_tree import find_photo_files
 from recon_cli.capture.photos import (
     PhotoFolder,
     PhotoGroup,
     check_count,
-    drop_other_pictures,
+    choose_pictures,
     group_notices,
     group_photos,
     list_photos,
@@ -41,6 +43,7 @@ from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import FormatError, InputError, ManifestError, list_names
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
 from recon_cli.io.tracks import Tracks
+from recon_cli.scene.camera import panorama_lens
 from recon_cli.workspace import atomic
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group
@@ -62,17 +65,19 @@ def ingest(
     kept; `prefix` is that of their names. InputError if too few photos can be read or show a view
     of their own, or a mask is broken.
     """
-    path, home, folder = _list_photos(paths, out, ctx)
+    path, home, folder = _list_photos(paths, out, config.camera, ctx)
     check_count(path, folder.photos, folder.broken)
     plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _drop_raw_twins(folder.photos, plan, ctx)
     white = _find_white(photos, ctx)
-    photos, sequence, strangers = _find_sequence(
-        photos, out / f"{prefix}{SEQUENCE}", ctx, white=white)
+    sequence, strangers = None, list[str]()
+    if not folder.panoramas:
+        photos, sequence, strangers = _find_sequence(
+            photos, out / f"{prefix}{SEQUENCE}", ctx, white=white)
     masks = _find_masks(paths, home, photos, ctx)
     stems = make_frame_names([photo.path.stem for photo in photos])
     source = _PhotoSource(path, tuple(photos), tuple(f"{prefix}{stem}" for stem in stems),
-                          masks.by_photo, plan, folder.broken, white)
+                          masks.by_photo, plan, folder.broken, white, folder.panoramas)
     taken = (_take_all(source, config, out, ctx) if sequence is None
              else _take_from_sequence(source, sequence, config, out, ctx))
     sheet = _make_sheet(source, taken.record, taken.broken, out)
@@ -81,8 +86,11 @@ def ingest(
     groups = group_photos(list(of_frame))
     for notice in group_notices(groups):
         ctx.notice(notice)
+    longest = source.longest_side(config.max_size)
     for width, height in dict.fromkeys((group.first.width, group.first.height) for group in groups):
-        report_reduced(width, height, config.max_size, ctx)
+        report_reduced(width, height, longest, ctx)
+    if source.panoramas:
+        hide_carried(out, [str(candidate.name) for candidate in of_frame.values()], ctx)
     count = len(photos) + len(strangers) + len(folder.broken)
     frames = tuple(sorted((
         Frame(str(of_frame[photo].name), None, photo.name, taken.sharpness.get(photo.name),
@@ -91,7 +99,7 @@ def ingest(
         for index, group in enumerate(groups) for photo in group.photos),
         key=lambda frame: frame.name))
     return IngestedSource(
-        "photos", _frame_groups(groups, path, config.max_size), frames,
+        "photos", _frame_groups(groups, path, source, longest, out, of_frame), frames,
         declared=count, decoded=count - len(taken.broken), lost=len(taken.broken),
         blurred=sum(candidate.reason in (Reason.BLURRED, Reason.CLIPPED)
                     and candidate.source in taken.sharpness for candidate in taken.record),
@@ -143,6 +151,11 @@ class _PhotoSource:
     plan: RawPlan
     broken: Mapping[str, str]  # why other files are not photos, by file name
     white: int  # the brightest value of those with 16 bits
+    panoramas: bool  # they are equirectangular
+
+    def longest_side(self, max_size: int) -> int:
+        """Returns the longest side of their frames: of panoramas, --max-size is the height."""
+        return 2 * max_size if self.panoramas else max_size
 
 
 @dataclass(frozen=True)
@@ -239,7 +252,7 @@ def _report_broken(broken: Mapping[str, str], ctx: IngestContext) -> None:
 
 
 def _list_photos(
-    paths: Sequence[Path], out: Path, ctx: IngestContext
+    paths: Sequence[Path], out: Path, camera: str, ctx: IngestContext
 ) -> tuple[Path, Path, PhotoFolder]:
     """Returns the path that represents the photos in messages, their folder, and the photos."""
     path = paths[0]
@@ -256,15 +269,15 @@ def _list_photos(
         home, found, taken = path.absolute().parent, list_photos(paths), set()
         notices = _describe_beside(paths, home)
         path = path if len(paths) == 1 else home
-    photos, left_out = drop_other_pictures(path if path.is_dir() else home, found.photos)
+    chosen, left_out = choose_pictures(path if path.is_dir() else home, found, camera)
     for folder in dict.fromkeys((path, home)):
-        for text in find_lists(folder, [photo.name for photo in photos], known=taken):
+        for text in find_lists(folder, [photo.name for photo in chosen.photos], known=taken):
             notices.append(
                 f"{text.name} names the photos and is not read: its data on them (such as "
                 "places or angles) are not used.")
     for notice in (*notices, *left_out):
         ctx.notice(notice)
-    return path, home, PhotoFolder(photos, found.broken)
+    return path, home, chosen
 
 
 def _describe_beside(paths: Sequence[Path], home: Path) -> list[str]:
@@ -364,7 +377,8 @@ def _write_photos(
             photo, name = source.photos[index], source.names[index]
             mask = source.masks.get(photo.name)
             try:
-                rgb = _write_photo(photo, mask, source, out, name, config.max_size)
+                rgb = _write_photo(photo, mask, source, out, name,
+                                   source.longest_side(config.max_size))
                 measures.append(frame_selection.measure_photo(rgb))
             except InputError as error:
                 unreadable[photo.name] = f"{error.message} {error.hint}".rstrip()
@@ -376,30 +390,40 @@ def _write_photos(
 
 def _write_photo(
     photo: Photo, mask_file: Path | None, source: _PhotoSource, out: Path, name: str,
-    max_size: int,
+    longest: int,
 ) -> NDArray[np.uint8]:
     """Writes a mask and then its frame, and returns the stored pixels, RGB, [H, W, 3]."""
     target = out / store.FOLDER / name
     if target.exists():
         return read_png(target)
     rgb = fit_image(develop(photo, source.plan) if photo.is_raw
-                    else read_photo(photo, source.white), max_size)
+                    else read_photo(photo, source.white), longest)
     height, width = rgb.shape[:2]
     mask = photo_mask(photo, mask_file, width, height)
+    if source.panoramas and photo.area is not None and not photo.area.is_full:
+        rgb, mask = fill_sphere(rgb, mask, photo.area)
     if mask is not None:
         write_mask(out / store.MASKS / name, mask)
     write_png(target, rgb)
     return rgb
 
 
-def _frame_groups(groups: Sequence[PhotoGroup], source: Path, max_size: int) -> tuple[Group, ...]:
+def _frame_groups(
+    groups: Sequence[PhotoGroup], path: Path, source: _PhotoSource, longest: int, out: Path,
+    of_frame: Mapping[Photo, FrameCandidate],
+) -> tuple[Group, ...]:
     """Returns the groups at the size at which their photos are stored."""
     frame_groups = []
     for group in groups:
-        name = source.name if len(groups) == 1 else f"{source.name}: {group.name}"
+        name = path.name if len(groups) == 1 else f"{path.name}: {group.name}"
         photo = group.first
-        width, height = fit_size(photo.width, photo.height, max_size)
-        scale = min(1.0, max_size / max(photo.width, photo.height))
+        if source.panoramas:
+            file = out / store.FOLDER / str(of_frame[photo].name)
+            height, width = read_png(file).shape[:2]
+            frame_groups.append(Group(name, width, height, lens=panorama_lens(width, height)))
+            continue
+        width, height = fit_size(photo.width, photo.height, longest)
+        scale = min(1.0, longest / max(photo.width, photo.height))
         focal = None if photo.focal_px is None else photo.focal_px * scale
         frame_groups.append(Group(name, width, height, focal_px=focal))
     return tuple(frame_groups)

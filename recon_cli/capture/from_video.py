@@ -14,13 +14,17 @@ from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_measures import check_exposure, well_exposed
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.masks import write_mask
+from recon_cli.capture.panorama_masks import hide_carried
+from recon_cli.capture.panorama_motion import measure_parallax
 from recon_cli.capture.repeats import find_stills, pick_representatives
 from recon_cli.capture.scan import Scan, decode_threads, measure_scene, scan_video
+from recon_cli.capture.spherical_video import is_spherical
 from recon_cli.capture.static_overlay import MOST, PICTURE, draw_overlay, mask_overlay
 from recon_cli.capture.video import frames_at, read_declared_length
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io.images import fit_image, fit_size, write_png
+from recon_cli.scene.camera import panorama_lens
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group
 
@@ -38,6 +42,7 @@ class ScannedVideo:
     lengths: NDArray[np.float64]  # [F], `path_length` up to each frame
     judgement: frame_selection.Judgement
     standing: NDArray[np.int64]  # [F], the frame that stands for the picture of each
+    panoramas: bool = False  # its frames are equirectangular
 
     @property
     def distinct(self) -> NDArray[np.bool_]:  # [F]
@@ -65,7 +70,12 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     for notice in scan.notices:
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
-    return judge(config, path, scan, ctx)
+    if not is_spherical(path, scan.width, scan.height, len(scan.intact), config.camera):
+        return judge(config, path, scan, ctx)
+    ctx.notice(f"{path.name} is used as a 360-degree video (equirectangular); --camera perspective "
+               "uses it as an ordinary one.")
+    scan = replace(scan, motion=measure_parallax(scan.tracks))
+    return replace(judge(config, path, scan, ctx), panoramas=True)
 
 
 def judge(
@@ -140,14 +150,15 @@ def ingest(
     chosen = frame_selection.choose_frames(
         source.lengths, scan.sharpness, source.distinct, count, bridges=judgement.bridges)
     report_short(source, len(chosen), None if config.frames is None else count, ctx)
-    report_reduced(scan.width, scan.height, config.max_size, ctx)
+    longest = config.max_size * (2 if source.panoramas else 1)
+    report_reduced(scan.width, scan.height, longest, ctx)
     names = {int(index): f"{prefix}{index:06d}.png" for index in chosen}
     record = frame_selection.video_candidates(
         path.name, scan.sharpness, judgement.refused, source.lengths, names,
         standing=source.standing)
     sheet = ContactSheet(path.name, record, scan.width, scan.height)
-    _write(source, names, sheet, config.max_size, out, ctx)
-    width, height = fit_size(scan.width, scan.height, config.max_size)
+    _write(source, names, sheet, longest, out, ctx)
+    width, height = fit_size(scan.width, scan.height, longest)
     tracks = scan.tracks
     if scan.overlay is not None:
         tracks = tracks.outside(scan.overlay)
@@ -156,15 +167,20 @@ def ingest(
             write_mask(out / store.MASKS / name, mask)
         middle = list(names.values())[len(names) // 2]
         draw_overlay(out / store.FOLDER / middle, mask, out / f"{prefix}{PICTURE}")
+    if source.panoramas:
+        hide_carried(out, list(names.values()), ctx)
     frames = tuple(
         Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False,
-              masked=scan.overlay is not None)
+              masked=scan.overlay is not None or source.panoramas)
         for index, name in names.items())
+    # Tracks through panoramas are not used: their features match as far apart as they stand.
     return IngestedSource(
-        "video", (Group(path.name, width, height),), frames,
+        "video", (Group(path.name, width, height, lens=(
+            panorama_lens(width, height) if source.panoramas else None)),), frames,
         declared=scan.declared, decoded=int(scan.intact.sum()), lost=scan.lost,
         blurred=int((scan.intact & ~judgement.usable).sum()),
-        selection=Selection(record, sheet, prefix), tracks=tracks.select(names))
+        selection=Selection(record, sheet, prefix),
+        tracks=None if source.panoramas else tracks.select(names))
 
 
 def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:

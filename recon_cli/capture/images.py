@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from recon_cli.capture.colour_profile import to_srgb
-from recon_cli.capture.xmp import is_panorama, read_xmp
+from recon_cli.capture.xmp import PanoramaArea, is_panorama, panorama_area, read_xmp
 from recon_cli.errors import InputError
 from recon_cli.io.images import fit_size
 
@@ -81,6 +81,7 @@ class Photo:
     wide: bool = False  # its values have 16 bits
     pictures: int = 1  # of an animation, of which the first one is read
     panorama: bool = False  # its metadata says that no pinhole camera took it
+    area: PanoramaArea | None = None  # of the sphere, where it is equirectangular by its metadata
 
     @property
     def name(self) -> str:
@@ -108,13 +109,15 @@ def inspect_photo(path: Path, label: str = "") -> Photo:
             mode, wide, pictures = image.mode, _is_wide(image), _count_pictures(image)
             exif, (width, height) = image.getexif(), _size_in_file(image)
             lens = read_lens(exif, width, height)
-            panorama = is_panorama(read_xmp(image), width, height)
+            xmp = read_xmp(image)
+            panorama = is_panorama(xmp, width, height)
+            area = panorama_area(xmp, width, height)
             if exif.get(ExifTags.Base.Orientation) in QUARTER_TURNS:
                 width, height = height, width
     except BROKEN as error:
         raise unreadable_error(path, error) from error
     return Photo(path, width, height, *lens, label=label, mode=mode, wide=wide,
-                 pictures=pictures, panorama=panorama)
+                 pictures=pictures, panorama=panorama, area=area)
 
 
 def _count_pictures(image: Image.Image) -> int:

@@ -1,21 +1,24 @@
 """360-degree panoramas among photos: told by their metadata, or by their content.
 
-A panorama is not taken by a pinhole camera: treated as such it gives wrong cameras or none.
+A panorama is not taken by a pinhole camera: treated as such it gives wrong cameras or none. A
+folder is used as panoramas or as ordinary photos, whichever it holds more of.
 """
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import BROKEN, Photo, open_image
-from recon_cli.errors import InputError
+from recon_cli.capture.xmp import PanoramaArea
+from recon_cli.errors import InputError, list_names
 
 _SMALL = (256, 128)
 _CHECKED = 8  # panoramas of a set, evenly spread
@@ -24,6 +27,79 @@ _CHECKED = 8  # panoramas of a set, evenly spread
 # 60 of 60 panoramas pass both, and 1 of 446 photos of rooms that were cut to 2:1.
 _SEAM, _OPPOSITE, _POLE = 3.0, 3.0, 0.5
 _LEAST, _SHARE = 3, 0.5  # of the checked pictures must pass where no metadata says it
+_NAMED = 4
+_ASPECT = 0.02  # of an asked-for panorama, which cameras crop by some pixels
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The photos of a folder that are used, all of one projection."""
+
+    photos: tuple[Photo, ...]
+    panoramas: bool  # they are equirectangular
+    notices: tuple[str, ...] = ()
+
+
+def choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Projection:
+    """Returns the panoramas of a folder, or its ordinary photos; `camera` is that of IngestConfig.
+
+    InputError where too few of either are left, or a picture cannot be what was asked for.
+    """
+    if camera == "perspective":
+        return Projection(tuple(photos), panoramas=False)
+    if camera == "equirectangular":
+        odd = [photo for photo in photos if photo.area is None
+               and abs(photo.width / photo.height / 2 - 1) > _ASPECT]
+        if odd:
+            raise InputError(
+                f"{len(odd)} of {len(photos)} pictures in {folder} are not twice as wide as high, "
+                f"as panoramas are, such as {odd[0].name} ({odd[0].width}x{odd[0].height}).",
+                hint="Take them out of the folder, or leave --camera equirectangular out.")
+        return Projection(tuple(photos), panoramas=True)
+    found = find_panoramas(photos)
+    round_about = [photo for photo in found if photo.area or not photo.panorama]
+    others = [photo for photo in photos if photo not in found]
+    if len(round_about) >= MIN_FRAMES and len(round_about) > len(others):
+        left_out = [photo.name for photo in photos if photo not in round_about]
+        return Projection(tuple(round_about), True, (
+            f"{len(round_about)} pictures are used as 360-degree panoramas (equirectangular); "
+            "--camera perspective uses them as ordinary photos.",
+            *([f"{len(left_out)} pictures are left out, because they are not panoramas as the "
+               f"others are: {list_names(left_out, _NAMED)}."] if left_out else [])))
+    if found and len(others) < MIN_FRAMES:
+        raise InputError(
+            f"{len(found)} of the {len(photos)} pictures in {folder} are panoramas, such as "
+            f"{found[0].name}; {len(round_about)} of them are equirectangular, but at least "
+            f"{MIN_FRAMES} are needed.",
+            hint="Add panoramas from other places in the room, stitched to equirectangular "
+            "pictures twice as wide as high, or give the folder of ordinary photos.")
+    if found:
+        names = [photo.name for photo in found]
+        return Projection(tuple(others), False, (
+            f"{len(names)} panoramas are left out, because they are not pictures of ordinary "
+            f"lenses as the others are: {list_names(names, _NAMED)}. To use them, give them in a "
+            "folder of their own.",))
+    return Projection(tuple(others), panoramas=False)
+
+
+def fill_sphere(
+    rgb: NDArray[np.uint8],  # [H, W, 3], at any scale
+    mask: NDArray[np.uint8] | None,  # [H, W], 255 where a pixel counts, else 0
+    area: PanoramaArea,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Returns a cropped panorama as one of the full sphere, and its mask.
+
+    What it does not show is black, and masked.
+    """
+    scale = rgb.shape[1] / area.width
+    top, left = round(scale * area.top), round(scale * area.left)
+    height = max(round(scale * area.full_height), top + rgb.shape[0])
+    width = max(round(scale * area.full_width), left + rgb.shape[1])
+    full = np.zeros((height, width, 3), np.uint8)
+    counts = np.zeros((height, width), np.uint8)
+    rows, columns = slice(top, top + rgb.shape[0]), slice(left, left + rgb.shape[1])
+    full[rows, columns], counts[rows, columns] = rgb, 255 if mask is None else mask
+    return full, counts
 
 
 def find_panoramas(photos: Sequence[Photo]) -> list[Photo]:
@@ -59,21 +135,3 @@ def _read_small(photo: Photo) -> NDArray[np.uint8] | None:
         return np.asarray(image.convert("RGB").resize(
             (2 * _SMALL[0], 2 * _SMALL[1]), Image.Resampling.BOX))
     return None
-
-
-def panorama_error(name: str, panoramas: Sequence[Photo], count: int) -> InputError:
-    """Returns the error for a capture that is, but for a few pictures, panoramas."""
-    return InputError(
-        f"{len(panoramas)} of the {count} pictures in {name} are 360-degree panoramas "
-        f"(equirectangular), such as {panoramas[0].name}; needed are pictures of ordinary lenses.",
-        hint=panorama_advice(panoramas[0]))
-
-
-def panorama_advice(photo: Photo) -> str:
-    """Returns the command that cuts panoramas like this one into pictures that can be used."""
-    return (
-        "Cut each into six pictures of 90 degrees, and give the folder of these: mkdir -p faces; "
-        f"for f in {shlex.quote(str(photo.path.parent))}/*{photo.path.suffix}; do "
-        'for y in -120 -60 0 60 120 180; do ffmpeg -i "$f" -vf '
-        f"v360=e:flat:yaw=$y:h_fov=90:v_fov=90:w={photo.width // 4}:h={photo.width // 4} "
-        '"faces/$(basename "$f")_$y.png"; done; done; recon ingest faces')

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
-from recon_cli.capture.panoramas import find_panoramas, panorama_advice, panorama_error
+from recon_cli.capture.panoramas import choose_projection
 from recon_cli.capture.photo_tree import VIDEO_SUFFIXES
 from recon_cli.capture.picture_names import picture_kind
 from recon_cli.errors import InputError, list_names
@@ -30,6 +30,7 @@ class PhotoFolder:
 
     photos: tuple[Photo, ...]
     broken: dict[str, str]  # why a file that is named like a photo cannot be read, by its name
+    panoramas: bool = False  # the photos are equirectangular
 
 
 def list_photos(paths: Iterable[Path], home: Path | None = None) -> PhotoFolder:
@@ -56,28 +57,21 @@ def _order(label: str) -> tuple[list[list[tuple[int, str]]], list[tuple[int, str
     return [_natural_key(part) for part in path.parts[:-1]], _natural_key(path.stem), path.name
 
 
-def drop_other_pictures(
-    folder: Path, photos: Sequence[Photo]
-) -> tuple[tuple[Photo, ...], list[str]]:
-    """Returns the photos without depth maps, masks, labels and panoramas, and notices.
+def choose_pictures(
+    folder: Path, found: PhotoFolder, camera: str
+) -> tuple[PhotoFolder, list[str]]:
+    """Returns the photos of one projection, without depth maps, masks and labels, and notices.
 
-    Depth maps have one channel of 16 bits, where the others have colours. InputError where nothing
-    but depth maps, or but panoramas, is left.
+    Depth maps have one channel of 16 bits, where the others have colours. `camera` is that of
+    IngestConfig. InputError where nothing but depth maps, or too little of a projection, is left.
     """
-    rest, notices = _drop_depth_and_masks(folder, photos)
-    panoramas = find_panoramas(rest)
-    if panoramas and len(rest) - len(panoramas) < MIN_FRAMES:
-        raise panorama_error(folder.name, panoramas, len(rest))
-    if panoramas:
-        names = [photo.name for photo in panoramas]
-        notices.append(
-            f"{len(names)} 360-degree panoramas (equirectangular) are left out, because they are "
-            f"not pictures of ordinary lenses: {list_names(names, _NAMED)}. "
-            f"{panorama_advice(panoramas[0])}")
+    rest, notices = _drop_depth_and_masks(folder, found.photos)
+    chosen = choose_projection(folder.name, rest, camera)
+    notices += chosen.notices
     notices += [
         f"{photo.name} holds {photo.pictures} pictures, of which only the first is used. "
         f"{unfold_advice(photo)}" for photo in rest if photo.pictures > 1][:_NAMED]
-    return tuple(photo for photo in rest if photo not in panoramas), notices
+    return PhotoFolder(chosen.photos, found.broken, chosen.panoramas), notices
 
 
 def _drop_depth_and_masks(

@@ -47,6 +47,10 @@ def _color(
     help="Render these views instead of a path: a set, or a frame by its name; may be repeated.  "
          "[default: none]")
 @click.option(
+    "--panorama", is_flag=True,
+    help="Render 360-degree panoramas (equirectangular), level, 2048 pixels wide unless a size is "
+         "given; depth is then the distance from the camera.  [default: off]")
+@click.option(
     "--output", "outputs", default=OUTPUTS[0], metavar="rgb,depth,alpha,trust", callback=_outputs,
     show_default=True,
     help="Outputs to write. Depth is a 16-bit image, in millimetres if the scale is known, and a "

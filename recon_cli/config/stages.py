@@ -28,7 +28,9 @@ class IngestConfig(StageConfig):
         minimum=3, automatic="by camera motion, up to --max-frames")
     max_frames: int = option(
         3000, "Upper limit of the automatic number.", unit="frames", minimum=3)
-    max_size: int = option(1920, "Longest side of a stored frame.", unit="pixels", minimum=64)
+    max_size: int = option(
+        1920, "Longest side of a stored frame; of a panorama, its height.", unit="pixels",
+        minimum=64)
     holdout: str = option(
         "every:8", "Held-out test views: every:N (each Nth by name), segment:A:B (from share A to "
         "share B of the capture) or none.")
@@ -38,6 +40,11 @@ class IngestConfig(StageConfig):
     overlays: str = option(
         "mask", "Text, logos, dirt on the lens or a car's bonnet that stay in place in every frame "
         "of a video: mask or keep them.", choices=("mask", "keep"))
+
+    camera: str = option(
+        "auto", "Projection of the pictures: perspective, equirectangular (360-degree panoramas), "
+        "or auto (by metadata and content).",
+        choices=("auto", "perspective", "equirectangular"), late=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -24,6 +24,9 @@ SSIM_PADDED_CONVENTION = (
     "INRIA: the same window, zeros around the image, mean of all pixels; its borders score higher")
 MASK_CONVENTION = (
     "ignored pixels have no part in the squared error; the map of SSIM is averaged over the others")
+FACES_CONVENTION = (
+    "faces of panoramas together, each direction once: the squared error and the map of SSIM are "
+    "averaged over the sphere, by solid angle")
 LPIPS_CONVENTION = "LPIPS 0.1 with AlexNet, of the float render, lower is better"
 CONVENTIONS: dict[str, Any] = {  # as JSON files hold them
     "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
@@ -47,7 +50,20 @@ def psnr(
     error = _unit(image) - _unit(truth)
     if mask is not None:
         error = error[mask]
-    return float(-10 * np.log10(max(float(np.mean(error**2)), 1e-10)))
+    return to_decibels(float(np.mean(error**2)))
+
+
+def to_decibels(mean_square: float) -> float:
+    """Returns the PSNR in dB of a mean squared error of values in [0, 1], at most 100 dB."""
+    return float(-10 * np.log10(max(mean_square, 1e-10)))
+
+
+def weighted_error(
+    image: NDArray[Any], truth: NDArray[Any], weights: NDArray[np.float64]
+) -> float:
+    """Returns the sum of squared errors, means of the channels, times weights [H, W]."""
+    error = _unit(image) - _unit(truth)
+    return float(((error**2).mean(axis=2) * weights).sum())
 
 
 def corrected_psnr(
@@ -65,14 +81,15 @@ def corrected_psnr(
 
 def ssim(
     image: NDArray[np.float32], truth: NDArray[Any], mask: NDArray[np.bool_] | None = None,
-    *, padded: bool = False,
+    *, padded: bool = False, weights: NDArray[np.float64] | None = None,
 ) -> float:
     """Returns the structural similarity of an image [H, W, 3] clamped to [0, 1].
 
     With a mask [H, W]: the mean of the map over the pixels that count, of an image that is the
-    truth elsewhere. `padded` puts zeros around both images and scores every pixel, as INRIA's
-    scripts do; otherwise a border of half a window is left out. ValueError if the image is smaller
-    than the 11-pixel window, or the mask leaves nothing.
+    truth elsewhere. `weights` [H, W], zero where the mask is, make it a weighted one. `padded` puts
+    zeros around both images and scores every pixel, as INRIA's scripts do; otherwise a border of
+    half a window is left out. ValueError if the image is smaller than the 11-pixel window, or the
+    mask leaves nothing.
     """
     if min(truth.shape[:2]) < MIN_SIDE:
         raise ValueError(f"SSIM needs {MIN_SIDE} pixels a side, the image has {truth.shape[:2]}")
@@ -85,9 +102,13 @@ def ssim(
         around = ((BORDER, BORDER), (BORDER, BORDER))
         rendered, true = (np.pad(pixels, (*around, (0, 0))) for pixels in (rendered, true))
         mask = None if mask is None else np.pad(mask, around)
+        weights = None if weights is None else np.pad(weights, around)
     value, similarity = structural_similarity(
         rendered, true, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         data_range=1.0, channel_axis=-1, full=True)
+    if weights is not None:
+        inner = without_border(weights)
+        return float((without_border(similarity).mean(axis=2) * inner).sum() / inner.sum())
     return float(value if mask is None else without_border(similarity)[without_border(mask)].mean())
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.evaluation.metrics import Perceptual, corrected_psnr, psnr, ssim
+from recon_cli.evaluation.panoramas import FaceScore, face_weights, join_faces, score_face
 from recon_cli.evaluation.scores import MeanScore, ViewScore
 from recon_cli.io.images import fit_camera, to_uint8
 from recon_cli.io.views import MASK_HINT, ReferenceView, load_views
@@ -104,19 +105,29 @@ def score_views(
 ) -> RenderScores:
     """Renders every view, at least one, of a model and returns its scores.
 
-    `perceptual` is LPIPS; `on_view` gets each view and its render [H, W, 3], not clamped, in one of
-    `threads`.
+    The faces of a panorama are scored together, under the name of their frame. `perceptual` is
+    LPIPS; `on_view` gets each view and its render [H, W, 3], not clamped, in one of `threads`.
     """
-    def score(view: ReferenceView, image: NDArray[np.float32]) -> tuple[ViewScore, float]:
+    weights = face_weights(views)
+
+    def score(
+        view: ReferenceView, image: NDArray[np.float32]
+    ) -> tuple[ViewScore, float] | FaceScore:
+        if view.name in weights:
+            face = score_face(view, image, weights[view.name])
+            on_view(view, image)
+            return face
         photo, mask = view.image, view.mask
         scores = score_image(view.name, image, photo, mask, perceptual=perceptual)
         on_view(view, image)
         return scores, corrected_psnr(image, photo, mask)
 
     milliseconds: list[float] = []
-    scores, corrected = zip(*_measure(
-        splats, views, sh_degree, backend, score, threads=threads, milliseconds=milliseconds),
-        strict=True)
+    found = _measure(
+        splats, views, sh_degree, backend, score, threads=threads, milliseconds=milliseconds)
+    rows = [row for row in found if not isinstance(row, FaceScore)]
+    rows += join_faces([row for row in found if isinstance(row, FaceScore)])
+    scores, corrected = zip(*rows, strict=True)
     return RenderScores(scores, statistics.fmean(corrected), statistics.median(milliseconds))
 
 

@@ -17,7 +17,7 @@ from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.format import Guide, WriteSettings
@@ -92,12 +92,12 @@ class ExportSource:
             title = read_frame_list(self._inputs.folders["ingest"]).groups[0].name
         return WriteSettings(
             up=self.frame.up, antialiased=self._antialiased, title=title,
-            views=self.place(self.scene.train), guide=self._guide)
+            views=self.place(views_ahead(self.scene.train)), guide=self._guide)
 
     def _guide(self, splats: Splats) -> Guide | None:
         if not self.has_views:
             return None
-        cameras = [camera for _, camera in self.place(self.scene.train)]
+        cameras = [camera for _, camera in self.place(views_ahead(self.scene.train))]
         return make_guide(splats, cameras, self.ctx)
 
     @cached_property

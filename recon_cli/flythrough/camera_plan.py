@@ -13,6 +13,7 @@ import numpy as np
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.export.synthetic_cameras import CAMERAS_AROUND
 from recon_cli.flythrough.camera_path import CameraPath, read_camera_path
+from recon_cli.flythrough.panorama import WIDTH, panorama_camera
 from recon_cli.flythrough.request import (
     FPS,
     ORBIT,
@@ -26,7 +27,7 @@ from recon_cli.io.images import fit_camera, fit_size
 from recon_cli.machine import free_memory_bytes
 from recon_cli.scene.camera import MAX_SIDE, Camera
 from recon_cli.scene.camera_paths import find_look_at, orbit_path, smooth_path, tour_path
-from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.scene import Scene, View, views_ahead
 
 # Of a frame with all outputs, from 1200x680 to 3000x1700 pixels: 55 with numba, 93 with torch.
 _BYTES_PER_PIXEL = 100
@@ -42,7 +43,7 @@ class CameraPlan:
 
 
 def plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
-    """Returns the requested cameras.
+    """Returns the requested cameras; those of panoramas are level, and stand where they do.
 
     StageError if views are requested and there are none, ConfigError for a size or name that cannot
     be used, FormatError for the file of a path.
@@ -51,6 +52,17 @@ def plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
         raise StageError(
             "The scene was imported without views, so there are no cameras of its own to render.",
             hint=f"Give --path {ORBIT}, or --path FILE.json with cameras.")
+    plan = _plan_cameras(request, trained)
+    if not request.panorama:
+        return plan
+    width, _ = frame_size(WIDTH, WIDTH // 2, request)
+    up = trained.up()
+    return CameraPlan(f"{plan.name}_panorama", {
+        name: panorama_camera(camera.viewmat, up, 2 * (width // 2))
+        for name, camera in plan.cameras.items()}, plan.path)
+
+
+def _plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
     if request.views:
         views = _select_views(request.views, trained.scene)
         cameras = {
@@ -69,7 +81,7 @@ def plan_cameras(request: RenderRequest, trained: TrainedScene) -> CameraPlan:
 def _make_path(request: RenderRequest, trained: TrainedScene) -> CameraPath:
     """Returns the path through or around the training cameras, with their lens and size."""
     scene, count = trained.scene, request.frames()
-    cameras = [view.camera for view in scene.train]
+    cameras = [view.camera for view in views_ahead(scene.train)]
     if not trained.has_views:
         cameras = cameras[:CAMERAS_AROUND]  # the synthetic cameras after these are in the middle
     viewmats = np.stack([camera.viewmat for camera in cameras])

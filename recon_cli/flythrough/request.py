@@ -37,6 +37,7 @@ class RenderRequest:
     codec: str | None = None  # h264 or av1; None is h264
     crf: int | None = None  # quality of the video, smaller is better
     out: Path | None = None  # folder, .mp4 or .png; None is a folder in the workspace
+    panorama: bool = False  # each frame shows all directions
 
     def __post_init__(self) -> None:
         if self.file is None and self.path not in (TRAINING, ORBIT, TOUR):
@@ -96,6 +97,14 @@ class RenderRequest:
             raise ConfigError(
                 "--size and --width or --height exclude each other.",
                 hint="Leave --size out, or the others.")
+        if self.panorama and self.width and self.height and self.width != 2 * self.height:
+            raise ConfigError(
+                f"A panorama is twice as wide as high, not {self.width}x{self.height} pixels.",
+                hint="Give --size, --width or --height alone.")
+        if self.panorama and self.width and self.width % 2:
+            raise ConfigError(
+                f"--width is {self.width}; that of a panorama is even.",
+                hint="Give an even number.")
         if not all(0 <= value <= 255 for value in self.background or ()):
             raise ConfigError(
                 f"--background is {self.background}; values must be 0 to 255.",

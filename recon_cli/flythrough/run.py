@@ -12,7 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError, list_names
@@ -29,11 +31,14 @@ from recon_cli.flythrough.output import (
     encode_video,
     write_frame,
 )
+from recon_cli.flythrough.panorama import join_faces, render_panorama
 from recon_cli.flythrough.request import DEPTH, TRUST, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
 from recon_cli.io.images import is_whole_png
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.render import render
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
 from recon_cli.trust.scene_trust import Trust
 from recon_cli.workspace import layout
 from recon_cli.workspace.atomic import (
@@ -241,6 +246,7 @@ def _frame_settings(
     """Returns everything that decides the pixels of a frame, as JSON values."""
     cameras = plan.cameras
     return {
+        **({"panorama": True} if request.panorama else {}),
         "model": trained.model, "gaussians": trained.digest, "sh_degree": trained.sh_degree,
         "outputs": list(request.outputs), "background": list(request.background or ()) or "own",
         "sizes": [list(size) for size in sorted(
@@ -260,18 +266,28 @@ def _render_missing(
     background = splats.background if request.background is None else (
         torch.tensor(request.background, device=ctx.device) / 255)
     surfaces = scale.select_surfaces(splats) if DEPTH in request.outputs else splats
+    draw = render_panorama if request.panorama else render
     total = len(frames.names)
     with torch.no_grad(), ctx.progress.bar(
             "render", total, unit="frame", done=total - len(missing)) as bar:
         for name in missing:
             camera, degree = plan.cameras[name], trained.sh_degree
-            output = render(splats, camera, background, degree, backend=ctx.backend)
-            for_depth = output if surfaces is splats else render(
+            output = draw(splats, camera, background, degree, backend=ctx.backend)
+            for_depth = output if surfaces is splats else draw(
                 surfaces, camera, background, degree, backend=ctx.backend)
-            expected = None if trust is None else trust.expected_error(
-                splats, camera, ctx.backend)
+            expected = None if trust is None else _expect(
+                trust, splats, camera, ctx.backend, panorama=request.panorama)
             write_frame(frames.root, name, output, for_depth, request.outputs, scale, expected)
             bar.advance()
+
+
+def _expect(
+    trust: Trust, splats: Splats, camera: Camera, backend: str, *, panorama: bool
+) -> NDArray[np.float32]:
+    """Returns the expected error of a frame, [H, W]."""
+    if not panorama:
+        return trust.expected_error(splats, camera, backend)
+    return join_faces(camera, lambda face: trust.expected_error(splats, face, backend))
 
 
 def _encode_videos(frames: FrameFolder, encoding: VideoEncoding, ctx: StageContext) -> list[Path]:

@@ -17,6 +17,7 @@ from PIL import Image, UnidentifiedImageError
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.io.colmap_library import pycolmap, write_model
+from recon_cli.io.face_frames import read_face_frames
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
@@ -54,12 +55,12 @@ def read_scene(
     """
     sparse = undistorted / "sparse" if sparse is None else sparse
     twins = undistorted / "denoised" if denoised is None else denoised
-    views = []
+    views, frames = [], read_face_frames(undistorted)
     for name, inner, viewmat in _read_views(sparse):
         camera = Camera(inner.width, inner.height, inner.fx, inner.fy, inner.cx, inner.cy, viewmat)
         mask = undistorted / "masks" / name
         view = View(name, camera, undistorted / "images" / name, twins / name,
-                    mask if mask.exists() else None)
+                    mask if mask.exists() else None, frames.get(name))
         for path in filter(None, (view.original, view.denoised, view.mask)):
             _check_size(path, camera)
         views.append(view)
@@ -67,7 +68,7 @@ def read_scene(
     train, chosen, test = split_views(views, held_out, validation=validation)
     if not views or not len(points):
         raise model_error(sparse, f"{len(views)} views and {len(points)} points", _HINT)
-    missing = sorted(held_out - {view.name for view in views})
+    missing = sorted(held_out - {view.frame for view in views})
     return Scene(train, chosen, test, tuple(missing), points, colors, sparse=sparse)
 
 

@@ -22,6 +22,7 @@ class ReferenceView(TrainView):
     """A view with its original pixels, at the size it is scored at."""
 
     name: str = field(kw_only=True)
+    face_of: str | None = field(default=None, kw_only=True)  # as of `View`
 
 
 def load_views(
@@ -39,7 +40,8 @@ def load_views(
         image, mask = read_masked_image(path, view.mask, camera.width, camera.height)
         if file is not None:
             image = file.put(image)
-        return ReferenceView(camera, image, mask, name=view.name, file=file)
+        return ReferenceView(
+            camera, image, mask, name=view.name, face_of=view.face_of, file=file)
 
     with ThreadPoolExecutor(threads) as pool:
         every = list(pool.map(read, views))

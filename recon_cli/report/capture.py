@@ -26,7 +26,7 @@ from recon_cli.report.gallery import data_uri, encode_sheet
 from recon_cli.report.stage_status import StageReports
 from recon_cli.report.trust_section import read_regions
 from recon_cli.scene.gravity import find_gravity, mean_up
-from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.workspace.records import FOLDER, Frame, describe_stretches, read_frame_list
 from recon_cli.workspace.summaries import SfmSummary
@@ -97,7 +97,7 @@ def read_capture(stages: StageReports) -> CaptureSection:
     sfm = stages["sfm"].read_summary(SfmSummary)
     left_out = sfm.left_out if sfm else ()
     plan, notes = _draw_plan(scene, sfm, read_regions(stages)) if scene else (None, ())
-    by_name = {view.name: part for part, views in by_part(scene).items()
+    by_name = {view.frame: part for part, views in by_part(scene).items()
                for view in views} if scene else {
         frame.name: "held out" if frame.held_out else "training" for frame in frames}
     missing = {
@@ -224,7 +224,8 @@ def draw_plan(
 
 def by_part(scene: Scene) -> Mapping[str, Sequence[View]]:
     """Returns the views of a scene by the names of PARTS."""
-    return dict(zip(PARTS, (scene.train, scene.validation, scene.test), strict=True))
+    parts = map(views_ahead, (scene.train, scene.validation, scene.test))
+    return dict(zip(PARTS, parts, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

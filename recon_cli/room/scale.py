@@ -130,7 +130,11 @@ def _locate(
     if place.pixel is None:
         return np.asarray(-viewmat[:3, :3].T @ viewmat[:3, 3])
     u, v = place.pixel
-    pinhole = pinholes[place.frame]
+    pinhole = pinholes.get(place.frame)
+    if pinhole is None:
+        raise ConfigError(
+            f"{place.frame} is a panorama, which has no single undistorted image to point into.",
+            hint="Name frames (their cameras) or points x,y,z instead of FRAME:u,v.")
     depth = _depth_at(place.frame, u, v, points @ viewmat[:3, :3].T + viewmat[:3, 3], pinhole)
     ray = np.array([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, 1.0])
     return np.asarray(viewmat[:3, :3].T @ (depth * ray - viewmat[:3, 3]))

@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError
 
 # Number of focal lengths that the parameters begin with, and of all parameters, by COLMAP's names
-# (src/colmap/sensor/models.h). The principal point follows the focal lengths.
+# (src/colmap/sensor/models.h). The principal point follows the focal lengths; a panorama has none,
+# only its width and height.
+PANORAMA = "EQUIRECTANGULAR"
 MODELS: dict[str, tuple[int, int]] = {
+    PANORAMA: (0, 2),
     "SIMPLE_PINHOLE": (1, 3), "PINHOLE": (2, 4), "SIMPLE_RADIAL": (1, 4), "RADIAL": (1, 5),
     "OPENCV": (2, 8), "OPENCV_FISHEYE": (2, 8), "FULL_OPENCV": (2, 12),
     "SIMPLE_RADIAL_FISHEYE": (1, 4), "RADIAL_FISHEYE": (1, 5), "THIN_PRISM_FISHEYE": (2, 12)}
@@ -38,8 +41,15 @@ class Lens:
             raise ValueError(f"{self.model} takes {MODELS[self.model][1]} parameters, "
                              f"not {len(self.params)}")
 
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the image shows all directions (equirectangular)."""
+        return self.model == PANORAMA
+
     def resized(self, width: int, height: int) -> Lens:
         """Returns the intrinsics of the same image resampled to width x height pixels."""
+        if self.is_panorama:
+            return panorama_lens(width, height)
         sx, sy = width / self.width, height / self.height
         focals, _ = MODELS[self.model]  # a single one takes the mean of both scales
         scales = [(sx + sy) / 2, sx, sy] if focals == 1 else [sx, sy, sx, sy]
@@ -48,12 +58,21 @@ class Lens:
             self, width=width, height=height, params=(*inner, *self.params[len(scales):]))
 
 
+def panorama_lens(width: int, height: int) -> Lens:
+    """Returns the lens of an equirectangular panorama, as COLMAP writes it."""
+    return Lens(PANORAMA, width, height, (float(width), float(height)))
+
+
 def make_lens(model: str, width: float, height: float, params: Sequence[float], where: str) -> Lens:
     """Returns the intrinsics of a file; FormatError if they are unknown or implausible."""
     if model not in MODELS:
         raise FormatError(
             f"{where} has the camera model {model}, known are {', '.join(MODELS)}.",
             hint="Undistort the images first, for example with COLMAP's image_undistorter.")
+    if model == PANORAMA:
+        raise FormatError(
+            f"{where} is a panorama ({model}); poses are read of ordinary lenses.",
+            hint="Give the folder of the panoramas as photos: recon finds their cameras itself.")
     focals, count = MODELS[model]
     if len(params) != count:
         raise FormatError(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.cells import Cell
+from recon_cli.scene.faces import face_order
 
 _REACH = 20.0  # extents; a room reaches some
 _LEAST_EXTENT = 0.05  # of the median distance of the points; a step aside in a room
@@ -21,11 +22,17 @@ _SAMPLES = 2000  # points looked at
 class View:
     """One registered image."""
 
-    name: str  # file name of its frame
+    name: str  # file name of its image: that of its frame, unless it is a face
     camera: Camera  # pinhole camera at the size of the undistorted image
     original: Path  # the undistorted image; scores are against these pixels
     denoised: Path  # the undistorted denoised twin; equal to `original` where nothing was denoised
     mask: Path | None = None  # undistorted, 255 where a pixel counts; None where all do
+    face_of: str | None = None  # name of the frame of which it is one of several faces, if it is
+
+    @property
+    def frame(self) -> str:
+        """The file name of its frame."""
+        return self.face_of or self.name
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,23 +81,37 @@ class Scene:
         return float(np.median(nearest))
 
 
+def views_ahead(views: Sequence[View]) -> tuple[View, ...]:
+    """Returns the views that show the way of the camera: of several faces the one that looks ahead.
+
+    That is the first in the order of `scene.faces` of those that are there.
+    """
+    by_frame: dict[str, list[View]] = {}
+    for view in views:
+        by_frame.setdefault(view.frame, []).append(view)
+    ahead = {min(each, key=lambda view: face_order(view.name)).name if len(each) > 1
+             else each[0].name for each in by_frame.values()}
+    return tuple(view for view in views if view.name in ahead)
+
+
 def split_views(
     views: Sequence[View], held_out: frozenset[str], *, validation: float | frozenset[str]
 ) -> tuple[tuple[View, ...], tuple[View, ...], tuple[View, ...]]:
     """Returns (train, validation, test) views, each sorted by name.
 
-    The test views are those named in `held_out`. Of the rest a share of `validation`, evenly
-    spread and at least one where the share is above 0 and four views remain, is set apart; or those
-    named in `validation`.
+    The test views are those of the frames named in `held_out`. Of the other frames a share of
+    `validation`, evenly spread and at least one where the share is above 0 and four remain, is set
+    apart with all of their views; or the views named in `validation`.
     """
     ordered = sorted(views, key=lambda view: view.name)
-    test = tuple(view for view in ordered if view.name in held_out)
-    rest = [view for view in ordered if view.name not in held_out]
+    test = tuple(view for view in ordered if view.frame in held_out)
+    rest = [view for view in ordered if view.frame not in held_out]
     if isinstance(validation, frozenset):
         chosen = {i for i, view in enumerate(rest) if view.name in validation}
         return (tuple(view for i, view in enumerate(rest) if i not in chosen),
                 tuple(rest[i] for i in sorted(chosen)), test)
-    count = max(1, round(len(rest) * validation)) if validation > 0 and len(rest) >= 4 else 0
-    chosen = {int((i + 0.5) * len(rest) / count) for i in range(count)}
-    train = tuple(view for i, view in enumerate(rest) if i not in chosen)
-    return train, tuple(rest[i] for i in sorted(chosen)), test
+    frames = list(dict.fromkeys(view.frame for view in rest))
+    count = max(1, round(len(frames) * validation)) if validation > 0 and len(frames) >= 4 else 0
+    apart = {frames[int((i + 0.5) * len(frames) / count)] for i in range(count)}
+    return (tuple(view for view in rest if view.frame not in apart),
+            tuple(view for view in rest if view.frame in apart), test)

@@ -19,6 +19,13 @@ from scipy.sparse import csr_matrix
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database as database_file
 from recon_cli.sfm.limits import MAX_ERROR_PX, MIN_PAIR_EXPLAINED
+from recon_cli.sfm.sphere import (
+    epipolar_errors,
+    is_panorama,
+    radian_px,
+    ray_frames,
+    unit_rays,
+)
 
 # It is explained by a point seen within this multiple of the model's mean error of it, within these
 # pixels: sharp videos come to .2 and shaken ones to 1. See `tests/bench/bench_verdict.py`.
@@ -148,6 +155,8 @@ def explained_matches(
     `offset` of it. An epipolar line alone does not tell a pattern that repeats along it.
     """
     motion = second.cam_from_world() * first.cam_from_world().inverse()
+    if is_panorama(first.camera) or is_panorama(second.camera):
+        return _explained_on_sphere(first, ours, second, theirs, least_depth, offset)
     at_infinity = lift_rays(first.camera, ours) @ motion.rotation.matrix().T
     target = np.asarray(second.camera.cam_from_img(theirs))
     inverse = inverse_depths(at_infinity, target, motion.translation)
@@ -156,6 +165,26 @@ def explained_matches(
     places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
     errors = np.linalg.norm(places - target, axis=1) * second.camera.mean_focal_length()
     return np.asarray(errors <= offset)  # NaN, behind the camera, does not agree
+
+
+def _explained_on_sphere(
+    first: pycolmap.Image, ours: NDArray[np.float64], second: pycolmap.Image,
+    theirs: NDArray[np.float64], least_depth: float, offset: float,
+) -> NDArray[np.bool_]:  # [M]
+    """Does so where a camera is that of a panorama: each target is the middle of its own plane."""
+    motion = second.cam_from_world() * first.cam_from_world().inverse()
+    rays = unit_rays(first.camera, ours)
+    if not is_panorama(first.camera):  # their depth is that along the axis of the camera
+        rays = rays / rays[:, 2:]
+    frames = ray_frames(unit_rays(second.camera, theirs))
+    at_infinity = np.einsum("mij,mj->mi", frames, rays @ motion.rotation.matrix().T)
+    shift = frames @ motion.translation
+    inverse = -(at_infinity[:, :2] * shift[:, :2]).sum(axis=1) / np.maximum(
+        (shift[:, :2]**2).sum(axis=1), 1e-12)
+    most = 1 / least_depth if least_depth > 0 else np.inf
+    points = at_infinity + np.clip(inverse, 0, most)[:, None] * shift
+    places = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
+    return np.asarray(np.linalg.norm(places, axis=1) * radian_px(second.camera) <= offset)
 
 
 def lift_rays(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -179,7 +208,15 @@ def seen_depths(
 ) -> NDArray[np.float64]:  # [M]
     """Returns the depths of the points of the model that an image sees, in its camera."""
     seen = [places[point.point3D_id] for point in image.points2D if point.has_point3D()]
-    return np.asarray(image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2]
+    return camera_depths(image, np.array(seen).reshape(-1, 3))
+
+
+def camera_depths(
+    image: pycolmap.Image, positions: NDArray[np.float64]  # [M, 3]
+) -> NDArray[np.float64]:  # [M]
+    """Returns the depths of points in a camera, in a panorama their distances from it."""
+    local = np.asarray(image.cam_from_world() * positions)
+    return np.asarray(np.linalg.norm(local, axis=1) if is_panorama(image.camera) else local[:, 2])
 
 
 def nearest_depth(depths: NDArray[np.float64]) -> float:
@@ -194,18 +231,25 @@ def _count_agreeing(
     matches: Sequence[NDArray[np.uint32]],
 ) -> NDArray[np.int64]:
     """Returns how many matches of each pair agree with the poses, [P]."""
-    rays = {index: np.asarray(image.camera.cam_from_img(keypoints[index]))
+    spherical = any(is_panorama(image.camera) for image in placed.values())
+    lift = unit_rays if spherical else pycolmap.Camera.cam_from_img
+    rays = {index: np.asarray(lift(image.camera, keypoints[index]))
             for index, image in placed.items()}
     agreeing = np.zeros(len(pairs), np.int64)
     for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
         if first not in placed or second not in placed:
             continue
         image, other = placed[first], placed[second]
-        essential = pycolmap.essential_matrix_from_pose(
-            other.cam_from_world() * image.cam_from_world().inverse())
+        motion = other.cam_from_world() * image.cam_from_world().inverse()
+        focal = (radian_px(image.camera) + radian_px(other.camera)) / 2
+        if spherical:
+            errors = epipolar_errors(
+                rays[first][rows[:, 0]], rays[second][rows[:, 1]], motion)
+            agreeing[pair] = len(rows) - np.count_nonzero(errors > MAX_ERROR_PX / focal)
+            continue
+        essential = pycolmap.essential_matrix_from_pose(motion)
         squares = np.array(pycolmap.compute_squared_sampson_error(
             rays[first][rows[:, 0]], rays[second][rows[:, 1]], essential))
-        focal = (image.camera.mean_focal_length() + other.camera.mean_focal_length()) / 2
         # Not "<": two cameras in one place have no epipolar lines (NaN) and contradict nothing.
         agreeing[pair] = len(rows) - np.count_nonzero(squares > (MAX_ERROR_PX / focal) ** 2)
     return agreeing
@@ -257,7 +301,7 @@ def _usual_depths(
     for index, image in placed.items():
         seen = shown[index][shown[index] >= 0]
         if len(seen):
-            depths[index] = np.median(np.asarray(image.cam_from_world() * positions[seen])[:, 2])
+            depths[index] = np.median(camera_depths(image, positions[seen]))
     return depths
 
 

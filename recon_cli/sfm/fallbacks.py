@@ -105,7 +105,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
     if skeleton.is_continuous(job):
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
-    elif count > FEW_PHOTOS and not job.split and not job.segments:
+    elif count > FEW_PHOTOS and not job.split and not job.segments and not job.panoramas:
         ways = (Fallback("coarse", f"the coarsest features of {count} frames show overlap",
                          skeleton.choose_coarse_pairs, skeleton.complete_coarse), *ways)
     if job.segments:

@@ -90,6 +90,13 @@ class MappingJob(JsonRecord):
         return tuple(sorted(name for group in self.groups for name in group.names))
 
     @property
+    def panoramas(self) -> frozenset[str]:
+        """File names of the frames that show all directions."""
+        return frozenset(name for group in self.groups
+                         if group.lens is not None and group.lens.is_panorama
+                         for name in group.names)
+
+    @property
     def database(self) -> Path:
         """COLMAP's database of features and matches."""
         return self.matches_db or self.out / DATABASE

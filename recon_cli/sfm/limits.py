@@ -14,6 +14,10 @@ MIN_PAIR_INLIERS = 15
 MIN_POSE_INLIERS, MIN_POSE_SHARE = 30, 0.25
 # What the relaxed mapper takes for these two: as much as for a pair, and about half.
 RELAXED_POSE_INLIERS, RELAXED_POSE_SHARE = MIN_PAIR_INLIERS, 0.15
+# Share of the matches of two panoramas that must fit one motion: a plane of rays through a panorama
+# meets many features by chance. Of pairs in one room .37 to .98, in neighbouring rooms .4 to .6, in
+# rooms that do not see each other at most .3, with up to 34 matches.
+MIN_PANORAMA_SHARE = 0.33
 # Tracks count beside features where a pair has fewer matches than this: they are less exact.
 FEW_PAIR_MATCHES = 100
 # An image with fewer keypoints is said to have too few. In six of eight captures 19 of 20 images

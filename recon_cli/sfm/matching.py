@@ -18,7 +18,12 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.database import scales
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
-from recon_cli.sfm.limits import MAX_TRIALS, MIN_DEEP_SHARE, MIN_PAIR_INLIERS
+from recon_cli.sfm.limits import (
+    MAX_TRIALS,
+    MIN_DEEP_SHARE,
+    MIN_PAIR_INLIERS,
+    MIN_PANORAMA_SHARE,
+)
 from recon_cli.sfm.results import MatchesResult
 
 CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
@@ -218,6 +223,8 @@ def _verification_options(job: MappingJob) -> pycolmap.TwoViewGeometryOptions:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.seed
     options.ransac.max_num_trials = MAX_TRIALS
+    if job.panoramas and len(job.panoramas) == len(job.names):
+        options.min_inlier_ratio = MIN_PANORAMA_SHARE
     return options
 
 

@@ -21,6 +21,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.floor_heights import SPREAD, compare_heights, measure_heights
 from recon_cli.sfm.limits import LOSS_SCALE
+from recon_cli.sfm.sphere import is_panorama, radian_px, ray_frames, unit_rays
 from recon_cli.workspace.json_record import JsonRecord
 
 # The scale of a stretch is that of its cameras' centres. It spans this share of the extent of all
@@ -150,36 +151,45 @@ class _Observations:
         images = [model.find_image_with_name(name) for name in order]
         self.centers = np.array([image.projection_center() for image in images])  # [F, 3]
         rotations = np.array([image.cam_from_world().rotation.matrix() for image in images])
-        rows, numbers, places, focals = [], [], [], []
+        rows, numbers, places, focals, frames = [], [], [], [], []
         for row, image in enumerate(images):
             spots = [spot for spot in image.points2D if spot.has_point3D()]
             rows.append(np.full(len(spots), row))
             numbers += [spot.point3D_id for spot in spots]
             pixels = np.array([spot.xy for spot in spots]).reshape(-1, 2)
+            focals.append(np.full(len(spots), radian_px(image.camera)))
+            if is_panorama(image.camera):  # an error is looked at in the plane across its ray
+                frames.append(ray_frames(unit_rays(image.camera, pixels)))
+                places.append(np.zeros((len(spots), 2)))
+                continue
+            frames.append(np.tile(np.eye(3), (len(spots), 1, 1)))
             places.append(np.asarray(image.camera.cam_from_img(pixels)).reshape(-1, 2))
-            focals.append(np.full(len(spots), image.camera.mean_focal_length()))
         known, point = np.unique(np.array(numbers, np.int64), return_inverse=True)
         points = np.array([model.point3D(int(number)).xyz for number in known]).reshape(-1, 3)
         self.image, self.point, self.points = np.concatenate(rows), point, len(known)
         self._derive(rotations[self.image], points[point] - self.centers[self.image],
-                     np.concatenate(places), np.concatenate(focals)[:, None])
+                     np.concatenate(places), np.concatenate(focals)[:, None],
+                     np.concatenate(frames))
 
     def _derive(
         self, rotations: NDArray[np.float64], rays: NDArray[np.float64],
-        places: NDArray[np.float64], focal: NDArray[np.float64],
+        places: NDArray[np.float64], focal: NDArray[np.float64], frames: NDArray[np.float64],
     ) -> None:
         """Sets errors [O, 2] in pixels and their derivatives, weighted by the loss.
 
         By the camera's turn and centre [O, 2, 6], the point [O, 2, 3], the log of the focal length.
+        `frames` [O, 3, 3] turn the axes of the camera to those that an error is looked at in.
         """
-        x, y, z = local = np.einsum("oij,oj->oi", rotations, rays).T
+        local = np.einsum("oij,oj->oi", rotations, rays)
+        x, y, z = np.einsum("oij,oj->oi", frames, local).T
         self.depth = float(np.median(z)) if len(z) else 0.0  # usual depth of the points
         z = np.where(np.abs(z) > 1e-9, z, 1e-9)
         found = np.stack([x / z, y / z], axis=1)
         by_local = np.zeros((len(rays), 2, 3))
         by_local[:, 0, 0] = by_local[:, 1, 1] = focal[:, 0] / z
         by_local[:, :, 2] = -focal * found / z[:, None]
-        turn = np.cross(local.T[:, None], np.eye(3)[None]).transpose(0, 2, 1)
+        by_local = by_local @ frames
+        turn = np.cross(local[:, None], np.eye(3)[None]).transpose(0, 2, 1)
         by_point = by_local @ rotations
         errors = focal * (found - places)
         sizes = np.linalg.norm(errors, axis=1)

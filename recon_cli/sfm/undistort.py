@@ -9,6 +9,7 @@ from __future__ import annotations
 import filecmp
 import shutil
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publi
 from recon_cli.sfm.parts import check_part
 from recon_cli.sfm.results import PlacedResult, UndistortedResult
 from recon_cli.sfm.shared_points import to_sim3d
+from recon_cli.sfm.sphere import is_panorama
+from recon_cli.sfm.undistort_faces import write_views
 from recon_cli.workspace import atomic
 from recon_cli.workspace.records import read_poses
 from recon_cli.workspace.summaries import WorldSummary
@@ -51,7 +54,8 @@ def place_model(job: MappingJob) -> PlacedResult:
         given_up=None if known is None else known.up,
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
         metric=known is not None and known.metric,
-        pinholes={name: _pinhole(image.camera) for name, image in images.items()})
+        pinholes={name: _pinhole(image.camera) for name, image in images.items()
+                  if not is_panorama(image.camera)})
     model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")
     write_model(model, folder)
@@ -76,6 +80,10 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
     names = sorted(images)
     report.phase("undistorted", len(names))
     work = fresh_folder(job.out / "undistorted.partial")
+    if any(map(is_panorama, model.cameras.values())):
+        sizes = write_views(job, model, work, report, _flatten, (IMAGES, TWINS, MASKS, SPARSE))
+        publish(work, job.out / "undistorted")
+        return UndistortedResult(cameras=tuple(sizes))
     flat = _write_model(job, model, names[0], work)
     warps = {number: _warp(camera, flat.cameras[number])
              for number, camera in model.cameras.items()}
@@ -119,6 +127,16 @@ def _write_model(
     (between / SPARSE).rename(work / SPARSE)
     shutil.rmtree(between)
     return pycolmap.Reconstruction(work / SPARSE)
+
+
+def _flatten(
+    camera: pycolmap.Camera
+) -> tuple[pycolmap.Camera, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]]:
+    """Returns the camera of the undistorted image, and what makes that of a frame."""
+    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    flat.camera_id = camera.camera_id
+    warp = _warp(camera, flat)
+    return flat, lambda image: _remap(image, warp)
 
 
 def _warp(camera: pycolmap.Camera, flat: pycolmap.Camera) -> NDArray[np.float32]:  # [H, W, 2]

@@ -25,6 +25,7 @@ from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
 from recon_cli.sfm.limits import FEW_KEYPOINTS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
 from recon_cli.sfm.open_loops import OpenLoop, find_open_loops
 from recon_cli.sfm.scale_drift import MAX_SCALE_ERROR, ScaleCut, find_weakest_scale, is_scale_known
+from recon_cli.sfm.sphere import is_panorama
 from recon_cli.sfm.still_points import MAX_STILL, find_still_share
 from recon_cli.sfm.visual_aliasing import VisualAliasing
 from recon_cli.sfm.weakest_cut import OutlierCamera, WeakestCut, find_weakest_cut
@@ -390,7 +391,8 @@ def describe_shifted_centres(model: pycolmap.Reconstruction, database: Path) -> 
     with pycolmap.Database.open(database) as opened:
         initial = {camera.camera_id: camera for camera in opened.read_all_cameras()}
     shifts = {number: _shift(camera, initial[number])
-              for number, camera in sorted(model.cameras.items()) if number in initial}
+              for number, camera in sorted(model.cameras.items())
+              if number in initial and not is_panorama(camera)}
     return [
         f"The principal point of camera {number} moved by {shift:.0%} of the image's longer side, "
         f"at most {MAX_SHIFT:.0%} is usual: parts of the model may be displaced against each other."

@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.scene.faces import panorama_pixels
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
+from recon_cli.sfm.sphere import is_panorama
 from recon_cli.workspace.json_record import JsonRecord
 
 # A point is expected in an image that sees it as nearly as another does: SIFT finds it again, while
@@ -166,6 +168,9 @@ def _project(image: pycolmap.Image, positions: NDArray[np.float64]) -> NDArray[n
     """
     camera = image.camera
     width, height = camera.width, camera.height
+    if is_panorama(camera):
+        local = np.asarray(image.cam_from_world() * positions).reshape(-1, 3)
+        return np.asarray(panorama_pixels(local, width, height) / (width, height))
     left, right, top, bottom = np.asarray(camera.cam_from_img(np.array([
         [0, height / 2], [width, height / 2], [width / 2, 0], [width / 2, height]], np.float64)))
     low, high = np.array([left[0], top[1]]), np.array([right[0], bottom[1]])

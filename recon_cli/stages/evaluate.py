@@ -24,11 +24,13 @@ from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
     CONVENTION_LINES,
     CONVENTIONS,
+    FACES_CONVENTION,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
     Perceptual,
     load_lpips,
 )
+from recon_cli.evaluation.panoramas import PanoramaPictures
 from recon_cli.evaluation.reference_views import (
     load_held_out_views,
     load_reference_views,
@@ -93,8 +95,11 @@ class _Evaluation:
         splats = read_ply(path).map(lambda tensor: tensor.to(self.ctx.device))
         degree = self.config.sh_degree
 
+        pictures = PanoramaPictures(self.held_out)
+
         def save(view: ReferenceView, image: NDArray[np.float32]) -> None:
-            _save_pictures(self.out, model, view, image)
+            for name, rendered, photo, mask in pictures.take(view, image):
+                _save_pictures(self.out, model, name, rendered, photo, mask)
             on_view()
 
         scores = score_views(
@@ -113,19 +118,21 @@ class _Evaluation:
 
     def counts(self) -> dict[str, Any]:
         """Returns how many views are scored, and the names of those that are not, for records."""
-        hidden = {view.name for view in self.scene.test} - {view.name for view in self.held_out}
+        scored = {view.face_of or view.name for view in self.held_out}
+        hidden = {view.frame for view in self.scene.test} - scored
         return {
-            "test_views": len(self.held_out),
+            "test_views": len(scored),
             "unregistered_test": tuple(self.scene.unregistered_test),
             "masked_out_test": tuple(sorted(hidden)) or None}
 
     def coverage(self) -> dict[str, Any]:
         """Returns how many frames there are and were trained on, and which have no camera."""
         scene = self.scene
-        registered = {view.name for view in (*scene.train, *scene.validation, *scene.test)}
+        registered = {view.frame for view in (*scene.train, *scene.validation, *scene.test)}
+        trained = {view.frame for view in scene.train}
         return {
             "frames": len(self.frames),
-            "training_views": None if self.import_record else len(scene.train),
+            "training_views": None if self.import_record else len(trained),
             "unregistered": tuple(
                 frame.name for frame in self.frames if frame.name not in registered)}
 
@@ -134,6 +141,7 @@ class _Evaluation:
         sizes = " and ".join(f"{width}x{height}" for width, height in sizes_of(
             [view.camera for view in self.held_out]))
         masked = sum(view.mask is not None for view in self.held_out)
+        faces = sum(view.face_of is not None for view in self.held_out)
         note = (f"{len(self.held_out)} held-out views at {sizes}, "
                 f"{len(self.scene.unregistered_test)} more without a camera\n{CONVENTION_LINES}"
                 f"LPIPS: {f'not measured, {lacking}' if lacking else LPIPS_CONVENTION}\n")
@@ -141,6 +149,8 @@ class _Evaluation:
             note += f"Masks on {masked} of {len(self.held_out)} views: {MASK_CONVENTION}\n"
         if self.protocol:
             note += f"Protocol {self.protocol}: {PROTOCOLS[self.protocol].words}; {SPLIT_WORDS}\n"
+        if faces:
+            note += f"{faces} of these views are {FACES_CONVENTION}\n"
         return note + "".join(
             f"{text}\n" for text in (self.import_record.warnings() if self.import_record else ()))
 
@@ -150,8 +160,10 @@ def run(
 ) -> EvaluateSummary:
     """Renders and scores the held-out views and returns the means of each model."""
     evaluation = _load(config, inputs, out, ctx)
+    pictures = PanoramaPictures(evaluation.held_out)
     for view in evaluation.held_out:
-        _save(out / "truth" / f"{Path(view.name).stem}.png", view.image)
+        for name, _, photo, _ in pictures.take(view, view.image.astype(np.float32)):
+            _save(out / "truth" / f"{Path(name).stem}.png", photo)
     perceptual, lacking = load_lpips()
     views = len(evaluation.held_out) + sum(map(len, evaluation.training_views.values()))
     with ctx.progress.bar("evaluate", len(evaluation.folders) * views, unit="view") as bar:
@@ -197,13 +209,16 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
         train_config.protocol if followed else None)
 
 
-def _save_pictures(out: Path, model: str, view: ReferenceView, image: NDArray[np.float32]) -> None:
+def _save_pictures(
+    out: Path, model: str, frame: str, image: NDArray[np.float32], photo: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+) -> None:
     """Saves the render of a held-out view, and its difference from the photo."""
-    name, rendered = f"{Path(view.name).stem}.png", to_uint8(image)
+    name, rendered = f"{Path(frame).stem}.png", to_uint8(image)
     _save(out / "renders" / model / name, rendered)
-    difference = np.abs(rendered.astype(np.int16) - view.image) * _GAIN
-    if view.mask is not None:
-        difference[~view.mask] = 0
+    difference = np.abs(rendered.astype(np.int16) - photo) * _GAIN
+    if mask is not None:
+        difference[~mask] = 0
     _save(out / "difference" / model / name, difference.clip(0, 255).astype(np.uint8))
 
 

@@ -83,7 +83,7 @@ def _run_segments(
     config: SfmConfig, job: MappingJob, ctx: StageContext
 ) -> segments.SegmentRuns:
     """Maps a long capture in segments and says which failed; leaves others as they are."""
-    together = job.known_poses or job.pairs != "auto"
+    together = job.known_poses or job.pairs != "auto" or bool(job.panoramas)
     number = 1 if together else segments.count_segments(
         segments.count_mapped(job), config.segments)
     if number == 1:

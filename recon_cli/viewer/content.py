@@ -23,7 +23,7 @@ from recon_cli.pipeline.execute import Job, last_sources, render_context
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.camera_paths import visible_depths
-from recon_cli.scene.scene import View
+from recon_cli.scene.scene import View, views_ahead
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import leaves_enough
 from recon_cli.splats.html import find_title
@@ -97,7 +97,7 @@ def load_workspace(job: Job, model: str) -> ViewerContent:
     parts = {HELD_OUT: scene.test, TRAINING: scene.train, VALIDATION: scene.validation}
     views = tuple(LabeledView(view, part) for part, members in parts.items() for view in members
                   if trained.has_views)
-    first = scene.train[0].camera
+    first = views_ahead(scene.train)[0].camera
     depths = visible_depths(first, scene.points)
     distance = float(np.median(depths)) if len(depths) else scene.extent
     return ViewerContent(

@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from recon_cli.errors import FormatError, ManifestError
-from recon_cli.scene.camera import Lens, make_lens
+from recon_cli.scene.camera import Lens, make_lens, panorama_lens
 from recon_cli.workspace import atomic
 from recon_cli.workspace.json_record import JsonRecord
 
@@ -78,7 +78,9 @@ def read_frame_list(stage: Path) -> FrameList:
     except ManifestError as error:
         raise FormatError(f"{stage / LIST} is not a list of frames.", hint=AGAIN) from error
     for lens in (group.lens for group in found.groups if group.lens is not None):
-        make_lens(lens.model, lens.width, lens.height, lens.params, "the list of frames")
+        if lens != panorama_lens(lens.width, lens.height):
+            make_lens(
+                lens.model, lens.width, lens.height, lens.params, "the list of frames")
     if not found.groups or not all(
             0 <= frame.group < len(found.groups) and Path(frame.name).name == frame.name
             for frame in found.frames):

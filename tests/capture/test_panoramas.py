@@ -1,11 +1,19 @@
-"""Panoramas are told by metadata or by what they show, and never trained on as photos."""
+"""Panoramas are told by metadata or by what they show, and never mixed with photos."""
 
 import numpy as np
+import pytest
 from media import texture
 from PIL import Image
 
 from recon_cli.capture.images import inspect_photo
-from recon_cli.capture.panoramas import find_panoramas, panorama_error, wraps_around
+from recon_cli.capture.panoramas import (
+    choose_projection,
+    fill_sphere,
+    find_panoramas,
+    wraps_around,
+)
+from recon_cli.capture.xmp import PanoramaArea
+from recon_cli.errors import InputError
 
 XMP = b'<r GPano:ProjectionType="equirectangular"/>'
 WAVES = np.random.default_rng(0).normal(scale=6, size=(3, 3))
@@ -54,9 +62,49 @@ def test_photos_twice_as_wide_as_high_stay_photos(tmp_path):
         tmp_path / "a", [texture(128, 256, seed=seed, coarseness=32) for seed in range(9)])) == []
 
 
-def test_the_error_says_how_to_cut_them(tmp_path):
-    listed = photos(tmp_path / "my pano", [sphere(0)] * 3, xmp=XMP)
-    error = panorama_error("my pano", listed, 3)
-    assert "3 of the 3 pictures in my pano are 360-degree panoramas" in error.message
-    assert f"'{tmp_path}/my pano'/*.jpg" in error.hint
-    assert "v360=e:flat:yaw=$y:h_fov=90:v_fov=90:w=64:h=64" in error.hint
+def test_a_folder_is_used_as_what_it_holds_more_of(tmp_path):
+    panoramas = photos(tmp_path / "a", [sphere(yaw) for yaw in range(5)])
+    others = photos(tmp_path / "b", [texture(96, 128)] * 7)
+    chosen = choose_projection("room", [*panoramas, *others[:4]], "auto")
+    assert (chosen.panoramas, list(chosen.photos)) == (True, panoramas)
+    assert "4 pictures are left out" in chosen.notices[1]
+    chosen = choose_projection("room", [*panoramas, *others], "auto")
+    assert (chosen.panoramas, list(chosen.photos)) == (False, others)
+    assert "5 panoramas are left out" in chosen.notices[0]
+
+
+def test_too_few_of_either_are_refused(tmp_path):
+    panoramas = photos(tmp_path / "a", [sphere(yaw) for yaw in range(2)], xmp=XMP)
+    with pytest.raises(InputError, match="2 of them are equirectangular") as error:
+        choose_projection("room", panoramas, "auto")
+    assert "twice as wide as high" in error.value.hint
+
+
+def test_cylinders_are_no_panoramas_of_the_sphere(tmp_path):
+    xmp = b'<r GPano:ProjectionType="cylindrical"/>'
+    cylinders = photos(tmp_path / "a", [texture(64, 128)] * 4, xmp=xmp)
+    with pytest.raises(InputError, match="0 of them are equirectangular"):
+        choose_projection("room", cylinders, "auto")
+
+
+def test_what_was_asked_for_is_done(tmp_path):
+    panoramas = photos(tmp_path / "a", [sphere(yaw) for yaw in range(5)], xmp=XMP)
+    chosen = choose_projection("room", panoramas, "perspective")
+    assert (chosen.panoramas, list(chosen.photos)) == (False, panoramas)
+    walls = photos(tmp_path / "b", [texture(128, 256, coarseness=32)] * 3)
+    assert choose_projection("room", walls, "equirectangular").panoramas
+    odd = photos(tmp_path / "c", [texture(96, 128)])
+    with pytest.raises(InputError, match=r"1 of 4 .* not twice as wide as high") as error:
+        choose_projection("room", [*walls, *odd], "equirectangular")
+    assert "0.jpg (128x96)" in error.value.message
+
+
+def test_a_cropped_panorama_lies_in_the_sphere_where_its_metadata_says():
+    rgb = np.full((40, 160, 3), 90, np.uint8)
+    area = PanoramaArea(left=40, top=80, width=320, height=80, full_width=400, full_height=200)
+    full, mask = fill_sphere(rgb, None, area)  # at half its size
+    assert full.shape == (100, 200, 3)
+    shown = np.zeros((100, 200), np.uint8)
+    shown[40:80, 20:180] = 255
+    np.testing.assert_array_equal(mask, shown)
+    np.testing.assert_array_equal(full[..., 1] > 0, shown > 0)

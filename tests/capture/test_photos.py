@@ -10,8 +10,9 @@ from PIL import Image
 
 from recon_cli.capture.images import Photo
 from recon_cli.capture.photos import (
+    PhotoFolder,
     check_count,
-    drop_other_pictures,
+    choose_pictures,
     group_notices,
     group_photos,
     list_photos,
@@ -21,6 +22,12 @@ from recon_cli.capture.photos import (
 from recon_cli.errors import InputError
 
 pytestmark = pytest.mark.floors
+
+
+def choose(folder, photos):
+    """Returns the chosen ones of the photos of a folder, and the notices."""
+    chosen, notices = choose_pictures(folder, PhotoFolder(tuple(photos), {}), "auto")
+    return chosen.photos, notices
 
 
 def photo(name, width=64, height=48, focal=None):
@@ -100,7 +107,7 @@ def names(photos):
 
 
 def test_depth_maps_and_masks_among_photos_are_left_out_and_named(tmp_path):
-    photos, notices = drop_other_pictures(tmp_path, pictures(
+    photos, notices = choose(tmp_path, pictures(
         tmp_path, frame="RGB", z="I;16", IMG_mask="L", conf="L"))
     assert names(photos) == ["frame"]
     assert [notice.split(" and not")[0] for notice in notices] == [
@@ -110,19 +117,19 @@ def test_depth_maps_and_masks_among_photos_are_left_out_and_named(tmp_path):
 @pytest.mark.parametrize("mode", ["I;16", "L"])
 def test_photos_without_colours_are_photos(tmp_path, mode):
     listed = pictures(tmp_path / "room", a=mode)
-    assert drop_other_pictures(tmp_path / "room", listed) == (listed, [])
+    assert choose(tmp_path / "room", listed) == (listed, [])
 
 
 def test_many_gray_photos_are_not_thrown_away_for_a_coloured_one(tmp_path):
     listed = pictures(tmp_path, a="I;16")
     Image.new("RGB", (8, 6)).save(tmp_path / "logo.png")
     (logo,) = list_photos([tmp_path / "logo.png"]).photos
-    assert drop_other_pictures(tmp_path, [*listed, logo]) == ((*listed, logo), [])
+    assert choose(tmp_path, [*listed, logo]) == ((*listed, logo), [])
 
 
 def test_a_folder_of_depth_maps_holds_no_photos(tmp_path):
     with pytest.raises(InputError, match="holds 4 depth maps") as caught:
-        drop_other_pictures(tmp_path / "depth", pictures(tmp_path / "depth", a="I;16"))
+        choose(tmp_path / "depth", pictures(tmp_path / "depth", a="I;16"))
     assert f"recon ingest {tmp_path}" in caught.value.hint
 
 
@@ -135,7 +142,7 @@ def test_an_animation_is_called_one_with_what_turns_it_into_photos(tmp_path, nam
         check_count(tmp_path / name, [photo], {})
     assert f"{program} " in caught.value.hint
     assert "recon ingest" in caught.value.hint
-    assert "5 pictures, of which only the first" in drop_other_pictures(tmp_path, [photo])[1][0]
+    assert "5 pictures, of which only the first" in choose(tmp_path, [photo])[1][0]
 
 
 def test_a_folder_with_a_video_but_no_photos_names_it(tmp_path):

@@ -1,6 +1,7 @@
 import pytest
 
-from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.errors import FormatError
+from recon_cli.scene.camera import MODELS, Lens, make_lens, panorama_lens
 
 
 def test_a_resized_image_keeps_its_rays_and_its_distortion():
@@ -25,3 +26,13 @@ def test_an_unknown_model_and_a_wrong_number_of_parameters_are_refused():
 def test_every_model_can_be_resized():
     for model, (_, count) in MODELS.items():
         assert len(Lens(model, 8, 6, (1.0,) * count).resized(4, 3).params) == count
+
+
+def test_a_panorama_has_its_size_alone():
+    lens = panorama_lens(1536, 768)
+    assert lens.is_panorama
+    assert lens.params == (1536.0, 768.0)
+    assert lens.resized(1024, 512) == panorama_lens(1024, 512)
+    with pytest.raises(FormatError, match="is a panorama") as error:
+        make_lens("EQUIRECTANGULAR", 1536, 768, (1536, 768), "cameras.txt")
+    assert "as photos" in error.value.hint

@@ -14,6 +14,8 @@ from PIL import Image
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io.tracks import Tracks
+from recon_cli.scene.camera import panorama_lens
+from recon_cli.workspace.records import read_frame_list
 
 
 @pytest.fixture
@@ -405,11 +407,32 @@ def test_panoramas_are_not_taken_for_photos(tmp_path, notices):
         Image.fromarray(blocks(64, 128, seed=9 + index)).save(
             folder / f"pano_{index}.jpg", xmp=xmp)
     assert take(folder, tmp_path / "out").frames == 3
-    assert any("3 360-degree panoramas" in notice for notice in notices())
+    assert any("3 panoramas are left out" in notice for notice in notices())
     for path in folder.glob("IMG_*"):
         path.unlink()
-    with pytest.raises(InputError, match="are 360-degree panoramas"):
-        take(folder, tmp_path / "again")
+    assert take(folder, tmp_path / "again").frames == 3
+    (group,) = read_frame_list(tmp_path / "again").groups
+    assert group.lens == panorama_lens(128, 64)
+    mask = np.asarray(Image.open(tmp_path / "again" / "masks" / "pano_0.png"))
+    assert (mask[:54] == 255).all()
+    assert (mask[56:] == 0).all()  # 25 degrees around the lowest point are 8.9 rows
+
+
+def test_a_cropped_panorama_is_used_in_its_place_of_the_sphere(tmp_path):
+    folder = tmp_path / "room"
+    folder.mkdir()
+    xmp = (b'<r GPano:ProjectionType="equirectangular" GPano:CroppedAreaImageWidthPixels="128" '
+           b'GPano:CroppedAreaImageHeightPixels="40" GPano:FullPanoWidthPixels="128" '
+           b'GPano:FullPanoHeightPixels="64" GPano:CroppedAreaLeftPixels="0" '
+           b'GPano:CroppedAreaTopPixels="12"/>')
+    for index in range(3):
+        Image.fromarray(blocks(40, 128, seed=index)).save(folder / f"p{index}.jpg", xmp=xmp)
+    take(folder, tmp_path / "out")
+    assert read_frame_list(tmp_path / "out").groups[0].lens == panorama_lens(128, 64)
+    mask = np.asarray(Image.open(tmp_path / "out" / "masks" / "p0.png"))
+    assert (mask[12:52] == 255).all()
+    assert (mask[:12] == 0).all()
+    assert np.asarray(Image.open(tmp_path / "out" / "frames" / "p0.png")).shape == (64, 128, 3)
 
 
 def test_poses_and_lists_beside_photos_are_named(tmp_path, notices):

@@ -1,0 +1,129 @@
+"""Scores of whole panoramas from those of their faces, each direction once, by its solid angle."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.evaluation.metrics import corrected_psnr, ssim, to_decibels, weighted_error
+from recon_cli.evaluation.scores import ViewScore
+from recon_cli.io.images import to_uint8
+from recon_cli.io.panoramas import panorama_axes, panorama_size, stitch_faces
+from recon_cli.io.views import ReferenceView
+from recon_cli.scene.faces import shared_out_angles
+from recon_cli.scene.train_view import without_border
+
+
+@dataclass(frozen=True)
+class FaceScore:
+    """What one face adds to the score of its panorama: sums over solid angles."""
+
+    frame: str  # name of the panorama
+    angle: float  # of the pixels that count, steradian
+    inner_angle: float  # of those off the border, where SSIM is known
+    error: float  # squared
+    error_8bit: float
+    ssim: float
+    ssim_padded: float
+    corrected: float  # squared error after the best gain
+
+
+def face_weights(views: Sequence[ReferenceView]) -> dict[str, NDArray[np.float64]]:
+    """Returns the weights [H, W] of the pixels of faces, by name: solid angles, zero if masked.
+
+    Empty where no view is a face.
+    """
+    faces: dict[str, list[ReferenceView]] = {}
+    for view in views:
+        if view.face_of is not None:
+            faces.setdefault(view.face_of, []).append(view)
+    weights = {}
+    for each in faces.values():
+        angles = shared_out_angles([view.camera for view in each])
+        for view, own in zip(each, angles, strict=True):
+            weights[view.name] = own if view.mask is None else own * view.mask
+    return weights
+
+
+def score_face(
+    view: ReferenceView, image: NDArray[np.float32], weights: NDArray[np.float64]
+) -> FaceScore:
+    """Returns what the render [H, W, 3] of a face adds to the score of its panorama."""
+    assert view.face_of is not None
+    photo, counts = view.image, weights > 0
+    inner = float(without_border(weights).sum())
+    angle = float(weights.sum())
+    similar = padded = corrected = 0.0
+    if inner > 0:
+        similar = inner * ssim(image, photo, counts, weights=weights)
+        padded = angle * ssim(image, photo, counts, padded=True, weights=weights)
+        corrected = angle * 10 ** (-corrected_psnr(image, photo, counts) / 10)
+    return FaceScore(
+        view.face_of, angle, inner, weighted_error(image, photo, weights),
+        weighted_error(to_uint8(image), photo, weights), similar, padded, corrected)
+
+
+def join_faces(faces: Sequence[FaceScore]) -> list[tuple[ViewScore, float]]:
+    """Returns the score of each panorama, and its PSNR after the best gains, in order of names."""
+    by_frame: dict[str, list[FaceScore]] = {}
+    for face in faces:
+        by_frame.setdefault(face.frame, []).append(face)
+    return [_join(frame, each) for frame, each in sorted(by_frame.items())
+            if sum(face.inner_angle for face in each) > 0]
+
+
+def _join(frame: str, faces: Sequence[FaceScore]) -> tuple[ViewScore, float]:
+    sums: Mapping[str, float] = {
+        name: sum(getattr(face, name) for face in faces)
+        for name in ("angle", "inner_angle", "error", "error_8bit", "ssim", "ssim_padded",
+                     "corrected")}
+    angle = sums["angle"]
+    score = ViewScore(
+        frame, to_decibels(sums["error"] / angle), to_decibels(sums["error_8bit"] / angle),
+        sums["ssim"] / sums["inner_angle"], sums["ssim_padded"] / angle, None,
+        min(1.0, angle / (4 * math.pi)))
+    return score, to_decibels(sums["corrected"] / angle)
+
+
+# A name, its render [H, W, 3], the photo and which pixels count; None for all.
+Picture = tuple[str, NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_] | None]
+
+
+class PanoramaPictures:
+    """Puts pictures of faces together to those of panoramas, once all faces are there."""
+
+    def __init__(self, views: Sequence[ReferenceView]) -> None:
+        self._faces: dict[str, list[str]] = {}
+        for view in views:
+            if view.face_of is not None:
+                self._faces.setdefault(view.face_of, []).append(view.name)
+        self._taken: dict[str, dict[str, tuple[ReferenceView, NDArray[np.float32]]]] = {}
+        self._lock = threading.Lock()
+
+    def take(self, view: ReferenceView, image: NDArray[np.float32]) -> Iterator[Picture]:
+        """Yields the picture of an ordinary view, or that of a panorama with its last face."""
+        frame = view.face_of
+        axes = None if frame is None else panorama_axes(view.name, view.camera)
+        if frame is None or axes is None:
+            yield view.name, image, view.image, view.mask
+            return
+        with self._lock:
+            taken = self._taken.setdefault(frame, {})
+            taken[view.name] = view, image
+            if len(taken) < len(self._faces[frame]):
+                return
+            del self._taken[frame]
+        views = [view for view, _ in taken.values()]
+        cameras, size = [view.camera for view in views], panorama_size(view.camera)
+        render = stitch_faces([image for _, image in taken.values()], cameras, axes, *size)
+        photo = stitch_faces(
+            [view.image.astype(np.float32) for view in views], cameras, axes, *size)
+        mask = stitch_faces([
+            np.ones((*view.image.shape[:2], 1), np.float32) if view.mask is None
+            else view.mask[..., None].astype(np.float32) for view in views], cameras, axes, *size)
+        yield frame, render, np.rint(photo).astype(np.uint8), mask[..., 0] > 0.5

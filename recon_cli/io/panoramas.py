@@ -1,0 +1,65 @@
+"""Panoramas put together from pictures of the faces of a cube."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.faces import CUBE, face_order, nearest_face, panorama_rays
+
+
+def stitch_faces(
+    pictures: Sequence[NDArray[np.float32]],  # [H, W, C] each
+    cameras: Sequence[Camera],  # of the pictures, all in one place
+    axes: NDArray[np.float64],  # [3, 3] from the world to the axes of the panorama
+    width: int, height: int,
+) -> NDArray[np.float32]:  # [height, width, C]
+    """Returns a panorama of which each pixel comes from the picture whose axis is nearest.
+
+    It is black where that picture does not reach.
+    """
+    rays = panorama_rays(width, height) @ axes
+    nearest = nearest_face(rays, [camera.viewmat[:3, :3] for camera in cameras])
+    panorama = np.zeros((height, width, pictures[0].shape[2]), np.float32)
+    for place, (picture, camera) in enumerate(zip(pictures, cameras, strict=True)):
+        own = nearest == place
+        local = rays[own] @ camera.viewmat[:3, :3].T
+        depth = np.maximum(local[:, 2], 1e-9)
+        x = local[:, 0] / depth * camera.fx + camera.cx
+        y = local[:, 1] / depth * camera.fy + camera.cy
+        inside = (x > -0.5) & (x < camera.width + 0.5) & (y > -0.5) & (y < camera.height + 0.5)
+        places = np.stack([x, y], axis=1)[:, None].astype(np.float32) - np.float32(0.5)
+        panorama[own] = _sample(picture, places) * inside[:, None]
+    return panorama
+
+
+def _sample(
+    picture: NDArray[np.float32], places: NDArray[np.float32]  # [K, 1, 2]
+) -> NDArray[np.float32]:  # [K, C]
+    """Returns the values at places, interpolated; in portions, as OpenCV's sizes are 16 bits."""
+    parts = [cv2.remap(picture, places[start:start + 32_000], None, cv2.INTER_LINEAR,
+                       borderMode=cv2.BORDER_REPLICATE).reshape(-1, picture.shape[2])
+             for start in range(0, len(places), 32_000)]
+    return np.concatenate([np.zeros((0, picture.shape[2]), np.float32), *parts])
+
+
+def panorama_axes(name: str, camera: Camera) -> NDArray[np.float64] | None:  # [3, 3]
+    """Returns the rotation from the world to a panorama, by the view of one of its faces.
+
+    None where the name is not that of a face of a cube.
+    """
+    place = face_order(name)
+    if place == len(CUBE):
+        return None
+    return np.asarray(CUBE[place].rotation.T @ camera.viewmat[:3, :3])
+
+
+def panorama_size(camera: Camera) -> tuple[int, int]:
+    """Returns the width and height of a panorama that is as fine as the middle of a face."""
+    height = max(2, 2 * round(math.pi * camera.fx / 2))
+    return 2 * height, height
