@@ -70,6 +70,8 @@ HOMES = {
     "ray": {"jobs"},
     "pycolmap": {"io"},
     "trimesh": {"io"},
+    "OpenEXR": {"io"},
+    "lzfse": {"datasets"},
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from recon_cli.datasets.depth_points import points_from_depth
 from recon_cli.datasets.layouts import describe, read_posed
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import InputError
+from recon_cli.io.depth_maps import write_depth, write_depth_list
 from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group, KnownPoses
@@ -62,6 +64,7 @@ def ingest(config: IngestConfig, path: Path, out: Path, ctx: IngestContext) -> I
     damaged = {image.path for name, image in zip(names, images, strict=True) if name in broken}
     poses = _make_known_poses(posed, readable, damaged)
     poses.write(out)
+    _write_depth(readable, out)
     masks, lenses = out / store.MASKS, posed.lenses
     sizes = [fit_size(lens.width, lens.height, config.max_size) for lens in lenses]
     return IngestedSource(
@@ -139,6 +142,21 @@ def _read_pixels(
     return rgb, opaque(opacity, image.name, width, height)
 
 
+def _write_depth(readable: Sequence[tuple[str, PosedImage]], out: Path) -> None:
+    """Writes the depth of the frames that may be trained on, as the sensor gave it."""
+    maps = {}
+    for name, image in readable:
+        if image.depth is not None and not image.held_out:
+            depth = image.depth.read()
+            height, width = depth.shape
+            maps[name] = write_depth(
+                out, name, depth, image.depth.own_lens(width, height), unit=image.depth.unit,
+                reliable=image.depth.reliable if math.isfinite(image.depth.reliable) else None,
+                confidence=image.depth.read_confidence())
+    if maps:
+        write_depth_list(out, maps)
+
+
 def _make_known_poses(
     posed: PosedSet, readable: Sequence[tuple[str, PosedImage]], damaged: Collection[Path]
 ) -> KnownPoses:
@@ -149,4 +167,5 @@ def _make_known_poses(
         rest = tuple(image for image in posed.images
                      if not image.held_out and image.path not in damaged)
         points, colors = points_from_depth(replace(posed, images=rest))
-    return KnownPoses(viewmats, posed.metric, points, colors)
+    return KnownPoses(viewmats, posed.metric, points, colors, up=posed.up, find_up=posed.find_up,
+                      accuracy=posed.accuracy)

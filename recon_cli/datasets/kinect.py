@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from recon_cli.datasets.depth_file import DepthFile
 from recon_cli.datasets.posed import (
-    DepthFile,
     PosedImage,
     PosedSet,
     image_size,

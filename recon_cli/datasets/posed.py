@@ -6,12 +6,9 @@ a lens of its size, as a `PosedSet`.
 
 from __future__ import annotations
 
-import math
-import struct
 import warnings
-import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -19,90 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from recon_cli.datasets.depth_file import DepthFile
 from recon_cli.errors import FormatError, InputError
-from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.scene.camera import Lens
+from recon_cli.workspace.records import PoseAccuracy
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")
-_MAX_DEPTH = float(np.finfo(np.float32).max)
-
-
-@dataclass(frozen=True)
-class DepthFile:
-    """Reads the z-depth of an image from its file.
-
-    Depth of another size than the image is looked up at the nearest pixel along the same ray,
-    because interpolation over an edge would give the depth of nothing. Distortion is left out.
-    """
-
-    path: Path  # the file
-    unit: float  # world units of a value of 1
-    lens: Lens  # intrinsics of the image
-    own: Lens | None = None  # intrinsics of the depth; None if it covers the same field of view
-    unknown: float = math.inf  # the value of the file that means unknown, as 0 does
-
-    def __call__(self) -> NDArray[np.float32]:
-        """Returns [H, W] z-depth at the size of the image, in world units, 0 where unknown.
-
-        FormatError if the file is missing, damaged or no depth.
-        """
-        stored = _read_depth(self.path).astype(np.float64)
-        values = np.where(stored == self.unknown, 0, stored) * self.unit
-        depth = np.where((values > 0) & (values < _MAX_DEPTH), values, 0).astype(np.float32)
-        height, width = depth.shape
-        own = self.own if self.own is not None else self.lens.resized(width, height)
-        if (width, height) != (own.width, own.height):
-            own = own.resized(width, height)
-        if own == self.lens:
-            return depth
-        columns, inside_x = _nearest_pixels(self.lens, own, 0, self.lens.width, width)
-        rows, inside_y = _nearest_pixels(self.lens, own, 1, self.lens.height, height)
-        resampled: NDArray[np.float32] = depth[np.ix_(rows, columns)]
-        resampled[~(inside_y[:, None] & inside_x[None, :])] = 0
-        return resampled
-
-
-def _read_depth(path: Path) -> NDArray[np.generic]:
-    hint = "Copy the file again, or delete it to go without its depth."
-    if not path.is_file():
-        raise FormatError(f"{path} is missing.", hint=hint)
-    try:
-        if path.suffix.lower() == ".npy":
-            values = np.asarray(np.load(path, allow_pickle=False))
-        else:
-            # Not OpenCV, which returns the first rows of a damaged PNG without an error.
-            with Image.open(path, formats=("PNG", "TIFF")) as image:
-                values = np.asarray(image)
-    except (OSError, ValueError, EOFError, SyntaxError, struct.error, zlib.error) as error:
-        raise FormatError(f"{path} cannot be read as depth: {error}.", hint=hint) from error
-    if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
-        raise FormatError(
-            f"{path} is not a depth image: it holds {values.dtype} of shape {values.shape}, "
-            "needed one value a pixel.", hint=hint)
-    return values
-
-
-def _nearest_pixels(
-    image: Lens, own: Lens, axis: int, size: int, own_size: int
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Returns the pixel of the depth that each pixel of the image falls in, and whether any."""
-    focal, center = _axis(image, axis)
-    own_focal, own_center = _axis(own, axis)
-    rays = (np.arange(size) + 0.5 - center) / focal
-    # The tiny offset decides exact halves, which rounding would otherwise do.
-    at = np.floor(rays * own_focal + own_center + 1e-6).astype(np.intp)
-    return at.clip(0, own_size - 1), (at >= 0) & (at < own_size)
-
-
-def _axis(lens: Lens, axis: int) -> tuple[float, float]:
-    """Returns focal length and principal point along x or y."""
-    focals, _ = MODELS[lens.model]
-    return lens.params[axis if focals == 2 else 0], lens.params[focals + axis]
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image whose camera is known; its file need not exist before `find_images`."""
+    """An image whose camera is known; its file need not exist before `find_images`.
+
+    The file is an image; or a video, of which it is one frame; or one that `read` reads.
+    """
 
     name: str  # unique within the set
     path: Path
@@ -111,6 +39,15 @@ class PosedImage:
     held_out: bool = False  # the data set itself holds it out for the score
     depth: DepthFile | None = None  # reads its depth, None without depth
     mask: Path | None = None  # file of a mask, None without mask
+    frame: int | None = None  # number of the frame in the video `path`, from 0
+    time: float | None = None  # seconds, on the clock of the capture
+    read: Callable[[], NDArray[np.uint8]] | None = None  # returns RGB [H, W, 3] of other files
+    blur: float | None = None  # by the app; more is blurrier, and only within one set
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether the file is an image."""
+        return self.frame is None and self.read is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +58,12 @@ class PosedSet:
     images: tuple[PosedImage, ...]  # in the order of the data set
     missing: tuple[str, ...] = ()  # names of images that it lists, but whose files do not exist
     metric: bool = False  # its unit is the metre
+    # Up [3], a unit vector in its world, where the program that wrote it knows.
+    up: tuple[float, float, float] | None = None
+    # Where up is None: its axes are arbitrary, so that up is to be found from the scene. Else the
+    # axes stay as they are.
+    find_up: bool = False
+    accuracy: PoseAccuracy = "solved"
     sequence: bool = False  # its images are frames of one walk, in order
     splits: bool = False  # it says itself which images are held out
     points: NDArray[np.float64] | None = None  # [P, 3] sparse points in its world, if it has any
@@ -156,14 +99,15 @@ def find_images(
             f"{where} lists {len(names)} images, but none of their files is there.{first}",
             hint="Put the images where the data set says, or give the folder that holds both.")
     missing = (*(item.name for item in listed if not is_file(item.path)), *missing)
-    sizes = [image_size(item.path) for item in existing]
+    sizes = [image_size(item.path) if item.is_picture else (item.lens.width, item.lens.height)
+             for item in existing]
     factor = _check_sizes(existing, sizes)
     images = []
     for item, size in zip(existing, sizes, strict=True):
         lens = item.lens
         if size != (lens.width, lens.height):
             lens = lens.resized(*size)
-        images.append(replace(item, lens=lens, depth=item.depth and replace(item.depth, lens=lens)))
+        images.append(replace(item, lens=lens, depth=item.depth and item.depth.with_lens(lens)))
     notices = []
     if missing:
         notices.append(f"missing: {len(missing)} of the {len(names)} images that it lists, "

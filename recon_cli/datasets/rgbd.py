@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.posed import DepthFile, PosedImage, PosedSet, find_images, image_size
+from recon_cli.datasets.depth_file import DepthFile
+from recon_cli.datasets.posed import PosedImage, PosedSet, find_images, image_size
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import lens_from_matrix, viewmat_from_pose
 from recon_cli.scene.camera import Lens, make_lens

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.datasets.depth_file import DepthFile
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.posed import (
-    DepthFile,
     PosedImage,
     PosedSet,
     find_images,

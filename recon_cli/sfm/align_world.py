@@ -22,7 +22,7 @@ from recon_cli.room.scale import (
     ScaleBetween,
     measure,
 )
-from recon_cli.scene.gravity import Gravity, find_gravity, upright_axes
+from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
 
@@ -51,20 +51,26 @@ def world_transform(
     gravity: bool,  # find up; False leaves the axes and the origin
     scale_between: ScaleBetween | None,
     metric: bool,  # the mapper's units are metres, as in a data set with measured poses
+    given_up: tuple[float, float, float] | None = None,  # unit vector that a data set knows
     pinholes: Mapping[str, Pinhole] | None = None,  # of undistorted frames, for FRAME:u,v
 ) -> WorldFrame:
     """Returns the world frame of a model.
 
     Up and the floor are used where cameras and points agree on them; otherwise the axes stay, and
-    the evidence says why. The scale is that of `scale_between`, whose points x,y,z are in the
-    turned frame, as a viewer shows it; the origin stays. ConfigError if a place is unknown.
+    the evidence says why. A given up becomes z, and neither heading nor origin change. The scale is
+    that of `scale_between`, whose points x,y,z are in the turned frame, as a viewer shows it; the
+    origin stays. ConfigError if a place is unknown.
     """
     names = sorted(viewmats)
     matrices = np.array([viewmats[name] for name in names]).reshape(-1, 4, 4)
-    up = (find_gravity(points, matrices) if gravity
+    up = (find_gravity(points, matrices) if gravity and given_up is None
           else Gravity(None, None, None, "it was not looked for"))
     turn, axis, strength = Similarity(), "mapper", None
-    if up.up is not None:
+    if gravity and given_up is not None:
+        given = np.array(given_up)
+        up = Gravity(given, None, None)
+        turn, axis = Similarity(rotation=turn_onto(given, np.array([0.0, 0.0, 1.0]))), "data set"
+    elif up.up is not None:
         axes = upright_axes(up, points, matrices)
         turn, strength = axes.similarity, axes.walls.strength
         axis = "walls" if axes.walls.found else "cameras"
@@ -101,6 +107,8 @@ def _evidence(gravity: Gravity, axis: str, strength: float | None, source: str) 
 def _describe_up(evidence: WorldEvidence, asked: bool) -> tuple[str, ...]:
     if not asked:
         return ()
+    if evidence.axis == "data set":
+        return ("z is up, as in the data set.",)
     if not evidence.up_found:
         return (f"Up is unknown, so the axes stay as they are: {evidence.up_reason}.",)
     if evidence.floor_found:

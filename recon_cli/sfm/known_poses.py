@@ -115,7 +115,7 @@ def _read_poses(job: MappingJob) -> KnownPoses:
     assert job.poses is not None
     known, names = read_poses(job.poses), set(job.names)
     viewmats = {name: matrix for name, matrix in known.viewmats.items() if name in names}
-    return KnownPoses(viewmats, known.metric, known.points, known.colors)
+    return replace(known, viewmats=viewmats)
 
 
 def _build_given_model(job: MappingJob, known: KnownPoses) -> pycolmap.Reconstruction:

@@ -35,20 +35,22 @@ IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 def place_model(job: MappingJob) -> PlacedResult:
     """Writes the model of the job's part, moved into the world frame, into out/sparse.
 
-    The axes of a data set with poses are left as they are. ConfigError
-    if the part, or a place of --scale-between, is unknown.
+    The axes of a data set with poses are left as they are, unless it knows up, or says that they
+    are arbitrary. ConfigError if the part, or a place of --scale-between, is unknown.
     """
     check_part(job)
     part = job.parts / str(job.part)
     model = pycolmap.Reconstruction(part)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    known = read_poses(job.poses) if job.known_poses and job.poses is not None else None
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
         {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
          for name, image in images.items()},
-        gravity=job.gravity and not job.known_poses,
+        gravity=job.gravity and (known is None or known.find_up or known.up is not None),
+        given_up=None if known is None else known.up,
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
-        metric=job.known_poses and job.poses is not None and read_poses(job.poses).metric,
+        metric=known is not None and known.metric,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()})
     model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")

@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +111,11 @@ def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[
     return stretches
 
 
+# How poses came about: "tracked" by a phone or headset as it moved, which drifts by centimetres and
+# a degree over a room; "solved" by bundle adjustment over all images; "exact", rendered.
+PoseAccuracy = Literal["tracked", "solved", "exact"]
+
+
 @dataclass(frozen=True, eq=False)
 class KnownPoses:
     """Poses that came with a data set."""
@@ -120,11 +126,15 @@ class KnownPoses:
     # [P, 3] float64 initial points in the same world, None without points
     points: NDArray[np.float64] | None = None
     colors: NDArray[np.uint8] | None = None  # [P, 3] uint8 RGB of the points
+    up: tuple[float, float, float] | None = None  # [3] unit vector in that world, None: not known
+    find_up: bool = False  # the axes of that world are arbitrary; else they stay where up is None
+    accuracy: PoseAccuracy = "solved"
 
     def write(self, stage: Path) -> None:
         """Writes both files into ingest's folder."""
         atomic.write_json(stage / POSES, {
-            "metric": self.metric, "points": self.points is not None,
+            "metric": self.metric, "points": self.points is not None, "up": self.up,
+            "find_up": self.find_up, "accuracy": self.accuracy,
             "viewmats": {name: matrix.tolist() for name, matrix in self.viewmats.items()}})
         if self.points is not None and self.colors is not None:
             with atomic.replacing(stage / POINTS) as temporary:
@@ -141,13 +151,27 @@ def read_poses(path: Path) -> KnownPoses:
             for name, matrix in value["viewmats"].items()}
         if not all(np.isfinite(matrix).all() for matrix in viewmats.values()):
             raise ValueError("a pose that is not finite")
+        poses = KnownPoses(
+            viewmats, bool(value["metric"]), up=_read_up(value.get("up")),
+            find_up=bool(value.get("find_up", False)), accuracy=value.get("accuracy", "solved"))
+        if poses.accuracy not in get_args(PoseAccuracy):
+            raise ValueError("poses of an unknown kind")
         if not value["points"]:
-            return KnownPoses(viewmats, bool(value["metric"]))
+            return poses
         tensors = load_file(path.with_name(POINTS))
-        return KnownPoses(viewmats, bool(value["metric"]), tensors["points"], tensors["colors"])
+        return dataclasses.replace(poses, points=tensors["points"], colors=tensors["colors"])
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError, OSError,
             SafetensorError) as error:
         raise FormatError(f"{path} does not hold poses.", hint=AGAIN) from error
+
+
+def _read_up(value: Sequence[float] | None) -> tuple[float, float, float] | None:
+    if value is None:
+        return None
+    x, y, z = map(float, value)
+    if not abs(x * x + y * y + z * z - 1) < 1e-6:
+        raise ValueError("an up that is not a unit vector")
+    return x, y, z
 
 
 def choose_held_out(names: Sequence[str], holdout: tuple[str, float, float]) -> frozenset[str]:

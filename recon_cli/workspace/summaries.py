@@ -90,7 +90,7 @@ class WorldEvidence(JsonRecord):
     floor_share: float | None  # of the points that lie in it
     floor_contrast: float | None  # density of points in it over that right above it
     floor_tilt_deg: float | None  # between its normal and up according to the cameras
-    axis: str  # direction of x: walls, cameras (their mean right) or mapper
+    axis: str  # direction of x: walls, cameras (their mean right), mapper or data set
     wall_strength: float | None  # sharpness of the points along the walls over the median direction
     scale_source: str  # arbitrary, data set or measured
     metres: bool  # one world unit is one metre

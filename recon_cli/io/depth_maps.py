@@ -1,0 +1,102 @@
+"""Sensor depth of ingested frames: one map a frame at the sensor's own size, with its confidence.
+
+ingest writes depth.json and depth/, for the frames that may be trained on. A map is a PNG of 16
+bits, named like its frame; levels of confidence (0 low, 1 medium, 2 high) lie beside it as 8 bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.errors import FormatError, ManifestError
+from recon_cli.io.images import decode_file, write_png
+from recon_cli.scene.camera import Lens, make_lens
+from recon_cli.workspace import atomic
+from recon_cli.workspace.json_record import JsonRecord
+from recon_cli.workspace.records import AGAIN
+
+DEPTH, LIST = "depth", "depth.json"
+_MOST = 65535  # value of 16 bits
+_CONFIDENCE = ".confidence.png"
+
+
+@dataclass(frozen=True)
+class DepthMap(JsonRecord):
+    """How the depth map of a frame is stored."""
+
+    lens: Lens  # intrinsics of the map, of its size
+    unit: float  # world units of a value of 1
+    confidence: bool  # it has levels
+    reliable: float | None = None  # world units; what is farther is a guess. None: no limit
+
+
+def write_depth(
+    stage: Path, name: str, depth: NDArray[np.float32], lens: Lens, *, unit: float | None = None,
+    reliable: float | None = None, confidence: NDArray[np.uint8] | None = None,
+) -> DepthMap:
+    """Writes the z-depth [h, w] of a frame in world units, 0 where unknown, and returns its record.
+
+    `unit` is kept if it can hold all values; else the largest value takes all 16 bits.
+    """
+    most = float(depth.max(initial=0))
+    if unit is None or most > _MOST * unit:
+        unit = most / _MOST if most > 0 else 1.0
+    folder = stage / DEPTH
+    folder.mkdir(parents=True, exist_ok=True)
+    write_png(folder / name, np.rint(depth.astype(np.float64) / unit).astype(np.uint16))
+    if confidence is not None:
+        write_png(_confidence(folder / name), confidence)
+    return DepthMap(lens, unit, confidence is not None, reliable)
+
+
+def write_depth_list(stage: Path, maps: Mapping[str, DepthMap]) -> None:
+    """Writes which frames have depth, by name, into ingest's folder."""
+    atomic.write_json(stage / LIST, {name: one.to_json() for name, one in maps.items()})
+
+
+def read_depth_list(stage: Path) -> dict[str, DepthMap]:
+    """Returns the depth maps of ingest's folder by frame; FormatError if the list is damaged."""
+    path = stage / LIST
+    if not path.exists():
+        return {}
+    try:
+        maps = {name: DepthMap.from_json(value)
+                for name, value in atomic.read_json(path, dict, hint=AGAIN).items()}
+        for name, one in maps.items():
+            make_lens(one.lens.model, one.lens.width, one.lens.height, one.lens.params, name)
+            if not 0 < one.unit < np.inf or Path(name).name != name:
+                raise ValueError(name)
+    except (ManifestError, ValueError) as error:
+        raise FormatError(f"{path} is not a list of depth maps.", hint=AGAIN) from error
+    return maps
+
+
+def read_depth(
+    stage: Path, name: str, one: DepthMap
+) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Returns z-depth [h, w] in world units, 0 where unknown, and levels [h, w] of confidence.
+
+    FormatError if a file is missing or damaged.
+    """
+    shape = (one.lens.height, one.lens.width)
+    path = stage / DEPTH / name
+    depth = _read(path, shape).astype(np.float64) * one.unit
+    levels = _read(_confidence(path), shape) if one.confidence else None
+    return depth.astype(np.float32), None if levels is None else np.asarray(levels, np.uint8)
+
+
+def _read(path: Path, shape: tuple[int, int]) -> NDArray[np.generic]:
+    data = decode_file(path, cv2.IMREAD_UNCHANGED)
+    if data is None or data.shape != shape:
+        raise FormatError(f"{path} cannot be read as a depth map.", hint=AGAIN)
+    return np.asarray(data)
+
+
+def _confidence(path: Path) -> Path:
+    return path.with_name(path.stem + _CONFIDENCE)
