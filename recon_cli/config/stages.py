@@ -94,8 +94,9 @@ class SfmConfig(StageConfig):
     """How cameras and points are found."""
 
     poses: str = option(
-        "keep", "Poses of a data set: keep them, refine them with the points, or ignore them.",
-        choices=("keep", "refine", "ignore"))
+        "auto", "Poses of a data set: keep them, refine them with the pictures, or ignore them. "
+        "auto: refine what a phone tracked, if it fits the pictures; keep others.",
+        choices=("auto", "keep", "refine", "ignore"))
     pairs: str = option(
         "auto", "Image pairs to match. auto: pairs that a first rough reconstruction shows to "
         "overlap; then more pairs and other mappers if the model is poor.",

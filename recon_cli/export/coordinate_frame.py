@@ -13,7 +13,14 @@ from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.room.measures import RoomFrame
-from recon_cli.room.scale import ARBITRARY, MEASURED, Measurement, ScaleBetween, measure
+from recon_cli.room.scale import (
+    ARBITRARY,
+    MEASURED,
+    PICKED_ERROR,
+    Measurement,
+    ScaleBetween,
+    measure,
+)
 from recon_cli.scene.gravity import camera_up, find_gravity, turn_onto
 from recon_cli.scene.similarity import Similarity
 from recon_cli.splats.axes import UP
@@ -22,9 +29,6 @@ from recon_cli.workspace.records import ImportRecord, has_views
 from recon_cli.workspace.summaries import WorldSummary
 
 _RIGID = 1e-6  # difference of a scale from 1
-# Relative error of --scale-between with two pixels: the depth of a pick in the middle was 0.5% and
-# 0.7% off in two rendered rooms; see room/scale.py.
-_PICKED_SCALE_ERROR = 0.007
 
 logger = logging.getLogger("recon")
 
@@ -75,7 +79,7 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
             "metres.",
             hint="Leave out the scale of --transform.")
     picked = frame.measurement is not None or source == MEASURED
-    error = _PICKED_SCALE_ERROR if picked else 0.0
+    error = PICKED_ERROR if picked else (world and world.evidence.scale_error) or 0.0
     if world and world.evidence.up_found:
         return RoomFrame(frame.similarity.rotation @ np.array(UP["z"]), error)
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"

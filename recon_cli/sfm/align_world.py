@@ -1,13 +1,13 @@
 """From the mapper's frame to the world: which way is up, where the floor is, how long a metre is.
 
 A mapper's frame is that of its first pair of images, in an arbitrary scale. `world_transform`
-combines what cameras, points and the user say about the world into one similarity, with its
-evidence. The user gives a scale by --scale-between: a known distance between two places.
+combines what cameras, points, a device and the user say about the world into one similarity, with
+its evidence. The user gives a scale by --scale-between: a known distance between two places.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,14 +17,18 @@ from recon_cli.io.colmap import Pinhole
 from recon_cli.room.scale import (
     ARBITRARY,
     DATA_SET,
+    FUSED,
     MEASURED,
     Measurement,
     ScaleBetween,
     measure,
 )
+from recon_cli.room.scale_fusion import FusedScale, ScaleSource, fuse
 from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
+
+_NAME = "--scale-between"  # as a source of the scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,7 @@ def world_transform(
     gravity: bool,  # find up; False leaves the axes and the origin
     scale_between: ScaleBetween | None,
     metric: bool,  # the mapper's units are metres, as in a data set with measured poses
+    sources: Sequence[ScaleSource] = (),  # what else tells the scale, in the order of trust
     given_up: tuple[float, float, float] | None = None,  # unit vector that a data set knows
     pinholes: Mapping[str, Pinhole] | None = None,  # of undistorted frames, for FRAME:u,v
 ) -> WorldFrame:
@@ -78,15 +83,24 @@ def world_transform(
     if scale_between:
         moved = {name: turn.viewmat(viewmats[name]) for name in names}
         measured = measure(scale_between, turn.points(points), moved, pinholes or {})
-    source = MEASURED if measured else DATA_SET if metric else ARBITRARY
-    evidence = _evidence(up, axis, strength, source)
-    scale = Similarity(scale=measured.scale) if measured else Similarity()
+    fused = None
+    if sources:
+        picked = [ScaleSource(_NAME, measured.scale, measured.error)] if measured else []
+        fused = fuse([*picked, *sources], decisive=_NAME if measured else None)
+        scale, source = fused.scale or 1.0, FUSED if fused.scale else ARBITRARY
+    else:
+        scale = measured.scale if measured else 1.0
+        source = MEASURED if measured else DATA_SET if metric else ARBITRARY
+    evidence = _evidence(up, axis, strength, source, fused)
+    described = fused.describe() if fused else (_describe_scale(source, measured, metric),)
     return WorldFrame(
-        scale.after(turn), evidence, measured,
-        (*_describe_up(evidence, gravity), _describe_scale(source, measured, metric)))
+        Similarity(scale=scale).after(turn), evidence, measured,
+        (*_describe_up(evidence, gravity), *described))
 
 
-def _evidence(gravity: Gravity, axis: str, strength: float | None, source: str) -> WorldEvidence:
+def _evidence(
+    gravity: Gravity, axis: str, strength: float | None, source: str, fused: FusedScale | None
+) -> WorldEvidence:
     cameras, floor = gravity.cameras, gravity.floor
     tilt = None
     if cameras is not None and floor is not None:
@@ -101,7 +115,10 @@ def _evidence(gravity: Gravity, axis: str, strength: float | None, source: str) 
         floor_share=None if floor is None else floor.share,
         floor_contrast=None if floor is None else floor.contrast,
         floor_tilt_deg=tilt, axis=axis, wall_strength=strength,
-        scale_source=source, metres=source != ARBITRARY)
+        scale_source=source, metres=source != ARBITRARY,
+        scale_error=fused.error if fused and fused.scale else None,
+        scale_sources=tuple(source.to_json() for source in (
+            *fused.used, *fused.contradicting)) if fused else ())
 
 
 def _describe_up(evidence: WorldEvidence, asked: bool) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Models from the poses of a data set, kept or refined, and checked against the images.
+"""Models from the poses of a data set, kept or taken as a start, and checked against the images.
 
 A data set with poses, points and lenses needs no features and takes a second or two. Poses whose
 axes follow another convention, or that belong to other images, would pass unnoticed then, so some
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,13 +19,22 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm import checks, database, features, mapper, matching, parts
+from recon_cli.sfm import (
+    checks,
+    database,
+    fallbacks,
+    features,
+    mapper,
+    matching,
+    parts,
+    tracked_poses,
+)
 from recon_cli.sfm.evidence import gather_evidence
-from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
 from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
 from recon_cli.sfm.merge_models import build_posed_model
 from recon_cli.sfm.results import MatchesResult, ModelResult
-from recon_cli.sfm.verdict import check_weak_link, examine
+from recon_cli.sfm.verdict import ModelVerdict, check_weak_link, examine
 from recon_cli.workspace.records import KnownPoses, read_poses
 from recon_cli.workspace.summaries import PosesSummary
 
@@ -40,8 +49,23 @@ Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
 
 
 def match_known(job: MappingJob, report: Reporter) -> MatchesResult:
-    """Matches neighbours in the order of names, and cameras that stand and look alike."""
+    """Matches neighbours in the order of names, and cameras that stand and look alike.
+
+    Of poses that are a start only, what overlaps by them. Where they do not fit the pictures, the
+    pairs are those of images without poses; SfmError if `refine` asks for the poses.
+    """
     poses = _read_poses(job).viewmats
+    if job.pose_use != "keep":
+        check = tracked_poses.match_near(job, poses, report)
+        if check.fits:
+            rest = {name: view for name, view in poses.items() if name not in check.contradicted}
+            tracked_poses.match_overlapping(job, rest, report)
+            found = matching.count_matches(job)
+        elif job.pose_use == "refine":
+            raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
+        else:
+            found = fallbacks.match_first(job, report)
+        return replace(found, poses_share=check.share, poses_contradicted=check.contradicted)
     matching.match_pairs(job, near_pairs(poses) | matching.sequential_pairs(list(poses)), report)
     return matching.count_matches(job)
 
@@ -71,15 +95,42 @@ def neighbours(
     return nearest
 
 
-def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
+def build_known_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelResult:
     """Writes the model of the given cameras into out/model and returns what it holds.
 
-    SfmError if too few frames have a pose, or the poses do not fit the images.
+    Where poses are a start that the pictures refute, the model of the pictures alone, unless
+    `refine` asks for the poses; `deadline` as for `fallbacks.build_model`. SfmError if too few
+    frames have a pose, or the poses do not fit the images.
     """
     known = _read_poses(job)
+    if job.pose_use == "keep":
+        return _keep(job, known, report)
+    matched = StepLog(job.out).result("matches", MatchesResult)
+    assert matched is not None, "matches come before the model"
+    share = matched.poses_share
+    if share is None or share >= MIN_SPOT_AGREEING:
+        checks.check_registered(job.names, list(known.viewmats), 0.0)
+        report.phase("mapping", len(job.names))
+        try:
+            return _start_from(job, known, matched.poses_contradicted)
+        except SfmError as error:
+            if job.pose_use == "refine":
+                raise
+            reason = error.message
+        matching_again = fallbacks.list_fallbacks(job)[0].choose_pairs(job, report)
+        matching.match_pairs(job, matching_again, report)
+    else:
+        reason = _misfit(share, MIN_SPOT_AGREEING).message
+    found = fallbacks.build_model(job, report, deadline=deadline)
+    return replace(
+        found, notes=(f"{reason} The cameras were found from the pictures alone.", *found.notes),
+        poses=PosesSummary(use="refuted", metric=known.metric))
+
+
+def _keep(job: MappingJob, known: KnownPoses, report: Reporter) -> ModelResult:
+    """Writes the model of the cameras as they are given."""
     checks.check_registered(job.names, list(known.viewmats), 0.0)
     report.phase("mapping", len(job.names))
-    movement: dict[str, float] = {}
     if "features" not in job.steps:
         model, verdict = _build_given_model(job, known), None
         check = spot_check(job, known.viewmats)
@@ -89,25 +140,56 @@ def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     else:
         posed = build_posed_model(job.database, None, _rigid(known.viewmats, known.viewmats))
         model = mapper.triangulate(job, posed, refine_intrinsics=bool(_uncalibrated_cameras(job)))
-        if job.pose_use == "refine":
-            movement = _refine(job, model, known)
-        # The share of the verified matches that the points confirm.
-        matches = sum(count for _, count, _ in database.count_inliers(job.database))
-        lengths = np.array([point.track.length() for point in model.points3D.values()])
-        share = float((lengths * (lengths - 1) / 2).sum()) / max(1, matches)
-        if share < MIN_CONFIRMED:
-            raise _misfit(share, MIN_CONFIRMED)
+        _check_confirmed(job, model)
         verdict = examine(
             model, job.database, sorted(known.viewmats), sharpness=job.sharpness, times=job.times,
             given=True)
         check_weak_link(verdict, job.accept_weak, given=True)
         notes = []
+    return _write(job, model, verdict, notes, PosesSummary(use="keep", metric=known.metric))
+
+
+def _start_from(
+    job: MappingJob, known: KnownPoses, contradicted: Collection[str]
+) -> ModelResult:
+    """Writes the model that the matches and the given cameras give together."""
+    start = {name: view for name, view in known.viewmats.items() if name not in contradicted}
+    fixed = set(range(1, len(job.groups) + 1)) - _uncalibrated_cameras(job)
+    found = tracked_poses.adjust_tracked(job, start, fixed)
+    model, names = found.model, mapper.list_registered(found.model)
+    _check_confirmed(job, model)
+    verdict = examine(
+        model, job.database, names, sharpness=job.sharpness, times=job.times, given=True)
+    check_weak_link(verdict, job.accept_weak, given=True)
+    notes = tracked_poses.describe_tracked(found, len(verdict.model_parts))
+    tracked_poses.hold_rest(model, found.held, start)
+    both = [name for name in mapper.list_registered(model) if name in start]
+    given = np.stack([start[name] for name in both])
+    model.transform(align_to_given(_viewmats(model, both), given))
+    moved = measure_movement(_viewmats(model, both), given)
+    return _write(job, model, verdict, notes, PosesSummary(
+        use=job.pose_use, metric=known.metric, held=len(found.held),
+        reprojection_error_px_before=found.error_before, **moved))
+
+
+def _check_confirmed(job: MappingJob, model: pycolmap.Reconstruction) -> None:
+    """Raises SfmError where the points confirm too few of the verified matches."""
+    matches = sum(count for _, count, _ in database.count_inliers(job.database))
+    lengths = np.array([point.track.length() for point in model.points3D.values()])
+    share = float((lengths * (lengths - 1) / 2).sum()) / max(1, matches)
+    if share < MIN_CONFIRMED:
+        raise _misfit(share, MIN_CONFIRMED)
+
+
+def _write(
+    job: MappingJob, model: pycolmap.Reconstruction, verdict: ModelVerdict | None,
+    notes: Sequence[str], poses: PosesSummary,
+) -> ModelResult:
     parts.write_parts(job, [(model, verdict)])
     shutil.rmtree(job.attempts, ignore_errors=True)
     return ModelResult(
         parts=(parts.describe_part(model, verdict),), notes=tuple(notes),
-        models=(model.num_reg_images(),),
-        poses=PosesSummary(use=job.pose_use, metric=known.metric, **movement))
+        models=(model.num_reg_images(),), poses=poses)
 
 
 def _read_poses(job: MappingJob) -> KnownPoses:
@@ -152,20 +234,6 @@ def _misfit(share: float, least: float) -> SfmError:
         f"at least {least:.0%} should.",
         hint="Check the axes convention of the poses, or let recon find the cameras with "
         "--poses ignore.")
-
-
-def _refine(job: MappingJob, model: pycolmap.Reconstruction, known: KnownPoses) -> dict[str, float]:
-    """Adjusts poses and points in place, aligns them with the given poses, returns the movement."""
-    error_before = model.compute_mean_reprojection_error()
-    fixed = set(model.cameras) - _uncalibrated_cameras(job)
-    for _ in range(2):  # the first one drops points that the given poses had spoilt
-        mapper.adjust(model, constant=fixed)
-    names = mapper.list_registered(model)
-    original = np.stack([known.viewmats[name] for name in names])
-    model.transform(align_to_given(_viewmats(model, names), original))
-    model.update_point_3d_errors()
-    return {**measure_movement(_viewmats(model, names), original),
-            "reprojection_error_px_before": error_before}
 
 
 def align_to_given(refined: Poses, given: Poses) -> pycolmap.Sim3d:

@@ -41,6 +41,8 @@ class MatchesResult(CountedResult):
 
     verified_pairs: int
     matches: int  # verified
+    poses_share: float | None = None  # of the matches, that agree with given poses
+    poses_contradicted: Names = ()  # frames whose given poses their own matches contradict
 
 
 @dataclass(frozen=True, kw_only=True)

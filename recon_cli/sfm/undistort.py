@@ -25,11 +25,11 @@ from recon_cli.sfm.align_world import world_transform
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
 from recon_cli.sfm.results import PlacedResult, UndistortedResult
+from recon_cli.sfm.scale_evidence import ask_device
 from recon_cli.sfm.shared_points import to_sim3d
 from recon_cli.sfm.sphere import is_panorama
 from recon_cli.sfm.undistort_faces import write_views
 from recon_cli.workspace import atomic
-from recon_cli.workspace.records import read_poses
 from recon_cli.workspace.summaries import WorldSummary
 
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
@@ -45,15 +45,14 @@ def place_model(job: MappingJob) -> PlacedResult:
     part = job.parts / str(job.part)
     model = pycolmap.Reconstruction(part)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    known = read_poses(job.poses) if job.known_poses and job.poses is not None else None
+    viewmats = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+                for name, image in images.items()}
+    device = ask_device(job, model, viewmats)
     world = world_transform(
-        np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
-        {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-         for name, image in images.items()},
-        gravity=job.gravity and (known is None or known.find_up or known.up is not None),
-        given_up=None if known is None else known.up,
+        np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,
+        gravity=job.gravity and device.axes_open, given_up=device.up,
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
-        metric=known is not None and known.metric,
+        metric=device.metric, sources=device.sources,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()
                   if not is_panorama(image.camera)})
     model.transform(to_sim3d(world.similarity))

@@ -60,8 +60,8 @@ def work(job: MappingJob, report: Reporter) -> None:
             known_poses.match_known if job.known_poses else fallbacks.match_first)(job, report),
         SPLIT: lambda: join_segments.split_by_view_graph(job),
         "model": lambda: (
-            known_poses.build_known_model(job, report) if job.known_poses
-            else fallbacks.build_model(job, report, deadline=deadline)),
+            known_poses.build_known_model if job.known_poses else fallbacks.build_model)(
+                job, report, deadline=deadline),
         "sparse": lambda: undistort.place_model(job),
         "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)

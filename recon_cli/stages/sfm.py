@@ -19,7 +19,13 @@ from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
 from recon_cli.sfm.results import MappingResult
 from recon_cli.sfm.time_estimate import Workload, estimate_for_notice, format_minutes
 from recon_cli.workspace import records as store
-from recon_cli.workspace.records import POSES, FrameList, describe_stretches, read_poses
+from recon_cli.workspace.records import (
+    POSES,
+    FrameList,
+    KnownPoses,
+    describe_stretches,
+    read_poses,
+)
 from recon_cli.workspace.summaries import (
     AttemptSummary,
     PartSummary,
@@ -50,12 +56,13 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     earlier = inputs.earlier
     mapped = earlier is not None and parts.take_over(
         earlier.folder, earlier.summary, earlier.changed | earlier.missing, out)
+    known = read_poses(poses) if poses.exists() else None
     job = MappingJob(
         frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER, out=out.resolve(),
         groups=_groups(frames),
         masks=ingest / store.MASKS if any(frame.masked for frame in frames.frames) else None,
-        poses=poses if poses.exists() else None, pose_use=config.poses,
-        given_points=poses.exists() and read_poses(poses).points is not None,
+        poses=poses if known else None, pose_use=_pose_use(config, known),
+        given_points=known is not None and known.points is not None,
         tracks=tracks if tracks.exists() else None, pairs=config.pairs,
         max_features=config.max_features, min_registered=config.min_registered,
         accept_weak=config.accept_weak, partial=config.partial, gravity=config.gravity == "auto",
@@ -77,6 +84,13 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     segments.remove_segments(job)
     database.unseal(job.database)
     return summary
+
+
+def _pose_use(config: SfmConfig, known: KnownPoses | None) -> str:
+    """Returns how poses are used: what a device tracked is a start, others stay."""
+    if config.poses == "auto" and (known is None or known.accuracy != "tracked"):
+        return "keep"
+    return config.poses
 
 
 def _run_segments(

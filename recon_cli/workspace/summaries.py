@@ -67,13 +67,15 @@ class AttemptSummary(JsonRecord):
 class PosesSummary(JsonRecord):
     """How given poses were used, and how far refinement moved them (None where it did not)."""
 
-    use: str  # keep or refine
+    # keep; refine or auto, which start from them; refuted: by the pictures, so not used
+    use: str
     metric: bool  # in metres
     moved_median: float | None = None  # of the camera centres, as a share of their path's size
     moved_max: float | None = None
     turned_median_deg: float | None = None
     turned_max_deg: float | None = None
     reprojection_error_px_before: float | None = None  # mean, with the given poses
+    held: int | None = None  # frames that only the given poses could place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +94,10 @@ class WorldEvidence(JsonRecord):
     floor_tilt_deg: float | None  # between its normal and up according to the cameras
     axis: str  # direction of x: walls, cameras (their mean right), mapper or data set
     wall_strength: float | None  # sharpness of the points along the walls over the median direction
-    scale_source: str  # arbitrary, data set or measured
+    scale_source: str  # arbitrary, data set, measured or fused
     metres: bool  # one world unit is one metre
+    scale_error: float | None = None  # relative standard error of a fused scale
+    scale_sources: tuple[Mapping[str, Any], ...] = ()  # that were fused, or contradict the others
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,97 @@
+"""One scale from all evidence: tracked poses, sensor depth, a measured distance.
+
+Each source says how many metres a unit has, and how exactly. Sources that agree are averaged by
+their inverse variance; one that contradicts the others is named and not used.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from recon_cli.errors import list_names
+from recon_cli.workspace.json_record import JsonRecord
+
+INTERVAL = 1.96  # standard errors, of an interval of 95% of a normal distribution
+# Sources contradict each other if they differ by more than this multiple of their common error.
+MOST_APART = 3.0
+# Where as many sources contradict as agree, the interval reaches to all, up to this share; what is
+# farther apart is a wrong unit, and no scale is taken.
+MOST_UNSURE = 0.2
+
+
+@dataclass(frozen=True)
+class ScaleSource(JsonRecord):
+    """What one source says about the scale."""
+
+    name: str  # as in a sentence
+    scale: float  # metres in a unit
+    error: float  # relative standard error
+
+
+@dataclass(frozen=True)
+class FusedScale:
+    """The scale by all sources that agree."""
+
+    scale: float | None  # metres in a unit; None where sources contradict and none can be chosen
+    error: float  # relative standard error
+    used: tuple[ScaleSource, ...]
+    contradicting: tuple[ScaleSource, ...]
+
+    def describe(self) -> tuple[str, ...]:
+        """Returns sentences for the terminal."""
+        others = tuple(
+            f"The scale by {source.name} is {_differ(source, self.used)} than by "
+            f"{_names(self.used)}: it is not used." for source in self.contradicting)
+        if self.scale is None:
+            apart = "; ".join(f"by {source.name} a unit has {source.scale:.4g} m"
+                              for source in (*self.used, *self.contradicting))
+            return (f"The scale is arbitrary, as its sources contradict each other: {apart}. "
+                    "--scale-between A B METRES decides.",)
+        return (f"One unit is one metre, to {INTERVAL * self.error:.1%}, by "
+                f"{_names(self.used)}.", *others)
+
+
+def fuse(sources: Sequence[ScaleSource], *, decisive: str | None = None) -> FusedScale:
+    """Returns the scale of one source or more, given in the order of trust.
+
+    The largest group that agrees is used, in a tie the one with the most trusted sources. A source
+    named `decisive` is in it in any case.
+    """
+    groups = [group for size in range(len(sources), 0, -1)
+              for group in itertools.combinations(sources, size)
+              if all(_agree(one, other) for one, other in itertools.combinations(group, 2))
+              and (decisive is None or any(source.name == decisive for source in group))]
+    used = groups[0]  # combinations come in the order of trust
+    others = tuple(source for source in sources if source not in used)
+    weights = [source.error**-2 for source in used]
+    mean = math.fsum(
+        weight * math.log(source.scale) for weight, source in zip(weights, used, strict=True)
+    ) / math.fsum(weights)
+    error = math.fsum(weights)**-0.5
+    if len(used) > 1:  # more apart than their errors say
+        chi = math.fsum(weight * (math.log(source.scale) - mean)**2
+                        for weight, source in zip(weights, used, strict=True)) / (len(used) - 1)
+        error *= max(1.0, math.sqrt(chi))
+    if len(others) >= len(used) and decisive is None:
+        farthest = max(abs(math.log(source.scale) - mean) for source in others)
+        if farthest > MOST_UNSURE:
+            return FusedScale(None, math.inf, used, others)
+        error = max(error, farthest / INTERVAL)
+    return FusedScale(math.exp(mean), error, used, others)
+
+
+def _agree(one: ScaleSource, other: ScaleSource) -> bool:
+    apart = abs(math.log(one.scale / other.scale))
+    return apart <= MOST_APART * math.hypot(one.error, other.error)
+
+
+def _names(sources: Sequence[ScaleSource]) -> str:
+    return list_names([source.name for source in sources])
+
+
+def _differ(source: ScaleSource, used: Sequence[ScaleSource]) -> str:
+    ratio = source.scale / used[0].scale
+    return f"{ratio - 1:.1%} larger" if ratio > 1 else f"{1 - ratio:.1%} smaller"
