@@ -33,7 +33,7 @@ ALLOWED: dict[str, set[str]] = {
     "kernels": {"machine", "scene"},
     "render": {"errors", "kernels", "machine", "scene"},
     "io": {"errors", "signals", "workspace", "scene"},
-    "splats": {"errors", "io", "scene", "workspace"},
+    "splats": {"errors", "io", "machine", "scene", "workspace"},
     "jobs": BASE | {"workspace"},
     "capture": READ,
     "datasets": READ | {"capture", "splats"},
