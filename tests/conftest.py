@@ -53,13 +53,23 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
     return report
 
 
-@pytest.fixture(autouse=True)
-def _own_threads() -> Iterator[None]:
-    """Gives every test torch's initial number of threads: sums of torch depend on it."""
-    yield
+@pytest.fixture(scope="session")
+def _initial_threads() -> int | None:
+    """Torch's number of threads before any test; None where no module of tests imports it."""
     torch = sys.modules.get("torch")
-    if torch is not None and "PYTEST_XDIST_WORKER" in os.environ and torch.get_num_threads() != 1:
-        torch.set_num_threads(1)
+    return None if torch is None else int(torch.get_num_threads())
+
+
+@pytest.fixture(autouse=True)
+def _own_threads(_initial_threads: int | None) -> Iterator[None]:
+    """Gives every test torch's initial number of threads: sums of torch depend on it.
+
+    A number that was set in another thread, such as a viewer's, does not show in this one, but new
+    threads get it.
+    """
+    yield
+    if _initial_threads is not None:
+        sys.modules["torch"].set_num_threads(_initial_threads)
 
 
 @pytest.fixture(scope="session")

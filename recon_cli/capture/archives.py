@@ -13,6 +13,7 @@ from pathlib import Path
 from recon_cli.capture.foreign import recognise_file
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.errors import InputError
+from recon_cli.workspace.export_formats import READABLE
 
 # First bytes, their offset, and the command that unpacks such a file into a folder.
 _UNPACK = "mkdir -p {folder} && {command} && recon ingest {folder}"
@@ -27,12 +28,12 @@ _SIGNATURES: tuple[tuple[bytes, int, str], ...] = (
     (b"\xfd7zXZ\0", 0, "tar -xf {file} -C {folder}"),
     (b"\x28\xb5\x2f\xfd", 0, "tar -xf {file} -C {folder}"),
 )
-_SCENES = frozenset({".ply", ".spz", ".splat", ".ksplat", ".sog"})
 _MESHES = frozenset({".glb", ".gltf", ".obj", ".fbx", ".usdz", ".stl", ".las", ".laz", ".e57"})
 _DATA = frozenset({
     ".bin", ".cfg", ".csv", ".db", ".exr", ".geojson", ".html", ".ini", ".json", ".jsonl", ".log",
     ".md", ".npy", ".npz", ".nvm", ".out", ".pdf", ".pkl", ".pt", ".pth", ".py", ".safetensors",
     ".sfm", ".toml", ".traj", ".tsv", ".txt", ".xml", ".xmp", ".yaml", ".yml"})
+_SCENES = frozenset(Path(row.file).suffix for row in READABLE) - _MESHES - _DATA
 
 
 def is_archive(path: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,7 +80,7 @@ _compute_options = options.stack([
 
 
 def _output_options(plot: str) -> Decorator:
-    """Returns a decorator that adds --json, --plot and --markdown as one `outputs`."""
+    """Returns a decorator that adds --out, --plot and --markdown as one `outputs`."""
     def decorate(function: Command) -> Command:
         @functools.wraps(function)
         def collect(
@@ -89,8 +90,8 @@ def _output_options(plot: str) -> Decorator:
             return function(*args, outputs=OutputFiles(json_file, plot, markdown), **typed)
 
         return options.stack([
-            click.option("--json", "json_file", type=_FILE,
-                         help="Write all figures to FILE.  [default: nowhere]"),
+            click.option("--out", "json_file", type=_FILE,
+                         help="Write all figures to FILE, as JSON.  [default: nowhere]"),
             click.option("--plot", type=_FILE, help=(
                 f"{plot} into a .png or .svg; needs recon-cli[plot].  [default: nowhere]")),
             click.option(
@@ -101,7 +102,23 @@ def _output_options(plot: str) -> Decorator:
     return decorate
 
 
-@click.group("bench", invoke_without_command=True, subcommand_metavar="[train ...]")
+class _OldSpelling(click.Command):
+    """Takes `--json FILE.json`, as --out was once called: every verb has a --json without FILE."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parses the words after the verb."""
+        pairs = zip(args, [*args[1:], ""], strict=True)
+        words = ["--out" if word == "--json" and after.endswith(".json")
+                 else re.sub(r"^--json=", "--out=", word) for word, after in pairs]
+        return super().parse_args(ctx, words)
+
+
+class _BenchGroup(_OldSpelling, click.Group):
+    pass
+
+
+@click.group(
+    "bench", cls=_BenchGroup, invoke_without_command=True, subcommand_metavar="[train ...]")
 @click.option(
     "--scene", type=click.Choice(["room", "small"]), default="room",
     help="room is 100,000 Gaussians at 640x360, small 10,000 at 320x180.  [default: room]")
@@ -126,7 +143,7 @@ def _output_options(plot: str) -> Decorator:
 @_output_options("Draw speed against error")
 @click.option(
     "--compare", type=options.PathType(dir_okay=False), metavar="FILE",
-    help="Print the ratio of each figure of an earlier --json FILE to this run's.  "
+    help="Print the ratio of each figure of an earlier --out FILE to this run's.  "
          "[default: none]")
 @options.verbosity
 @pass_call
@@ -157,7 +174,7 @@ def _refuse_own_options(ctx: click.Context) -> None:
                 f"{parameter.opts[0]} has no effect on {ctx.invoked_subcommand}.", ctx)
 
 
-@click.command("train")
+@click.command("train", cls=_OldSpelling)
 @_scene_options
 @click.option(
     "--recipes", multiple=True, metavar="NAME,...",

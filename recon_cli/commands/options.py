@@ -7,6 +7,7 @@ declared once, in config/stages.py, and only typed options reach the settings.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -28,6 +29,7 @@ from recon_cli.config.settings import (
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
 from recon_cli.jobs.executor import CORES
+from recon_cli.workspace.export_formats import READABLE
 from recon_cli.workspace.paths import refuse_special
 
 if TYPE_CHECKING:
@@ -135,8 +137,16 @@ class Option(click.Option):
 
 
 def verb(name: str) -> Callable[[Command], Verb]:
-    """Returns a decorator that makes a function the command `recon NAME`."""
-    return click.command(name, cls=Verb)
+    """Returns a decorator that makes a function the command `recon NAME`.
+
+    Its docstring is the help, with the formats that are read in place of {formats}.
+    """
+    def decorate(function: Command) -> Verb:
+        text = inspect.cleandoc(function.__doc__ or "")
+        formats = ", ".join(row.ending for row in READABLE)
+        return click.command(name, cls=Verb, help=text.replace("{formats}", formats))(function)
+
+    return decorate
 
 
 def explicit_settings(call: Call) -> Settings:

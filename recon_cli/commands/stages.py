@@ -106,10 +106,9 @@ def train(call: Call, with_prune: bool, with_view: bool) -> None:
 def import_scene(call: Call, file: Path | None) -> None:
     """Import a splat file instead of training.
 
-    FILE is a .ply, .compressed.ply, .splat, .spz, .sog or .glb of any program. In a workspace with
-    views (`recon ingest`, `recon sfm`) it is checked against some of them, and can be pruned and
-    scored; without, it can be viewed, rendered and exported. Without FILE, the previous file is
-    used.
+    FILE is a scene of any program: {formats}. In a workspace with views (`recon ingest`, `recon
+    sfm`) it is checked against some of them, and can be pruned and scored; without, it can be
+    viewed, rendered and exported. Without FILE, the previous file is used.
     """
     table = tuple(IMPORT if row.name == IMPORT.name else row for row in STAGES)
     run_stages(
@@ -173,8 +172,8 @@ def evaluate(
 ) -> None:
     """Score every model on the held-out views.
 
-    With ITEM, workspaces and splat files (.ply, .spz, .sog, .splat, .glb): their models in one
-    table. Files are scored on the views of the workspace.
+    With ITEM, workspaces and splat files ({formats}): their models in one table. Files are scored
+    on the views of the workspace.
     """
     if (caption or label) and (form != "latex" or not items):
         raise click.UsageError("--caption and --label need ITEM and --form latex.")

@@ -44,8 +44,8 @@ def view(
 ) -> None:
     """View the trained scene in the browser.
 
-    ITEM is a workspace (instead of -w) or a splat file (.ply, .spz, .sog, .splat, .glb). Ctrl-C
-    ends it.
+    ITEM is a workspace (instead of -w) or a splat file ({formats}). Ctrl-C ends
+    it.
     """
     workspace = _workspace(call, item)
     if item is not None and workspace is None and model != "auto":

@@ -32,7 +32,6 @@ _FAINT = 0.05  # opacity of nearly transparent ones
 _BULK = 0.9  # of the Gaussians lie within the radius
 _FAR = 100.0  # radii from the origin
 _WIDE = 10.0  # times the bulk: viewers that fit all start far away
-_UNIT = 0.01  # by which the length of a quaternion may differ from 1
 _MANY = 0.5  # share that is worth a word
 
 logger = logging.getLogger("recon")
@@ -139,12 +138,9 @@ def _find_problems(
     flat = int((splats.log_scales <= FLAT + 1e-3).any(dim=1).sum())
     if flat:
         found.append(f"{flat:,} of {count} Gaussians have a scale of 0")
-    none, other = int((lengths == 0).sum()), int(((lengths - 1).abs() > _UNIT).sum())
+    none = int((lengths == 0).sum())  # other lengths than 1 are usual, and every viewer mends them
     if none:
         found.append(f"{none:,} of {count} rotations are 0 0 0 0, which some viewers do not draw")
-    if other > none:
-        found.append(f"{other - none:,} of {count} quaternions are not of length 1, which most "
-                     "viewers mend")
     if scene.origin is not None:
         found.append(scene.origin.describe())
     middle = float(means.median(dim=0).values.norm())

@@ -42,6 +42,7 @@ from recon_cli.report.stage_status import (
 )
 from recon_cli.report.trust_section import read_trust
 from recon_cli.splats.html import ICON
+from recon_cli.trust.quality import delivered_model
 from recon_cli.workspace import atomic
 from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.layout import disk_errors
@@ -130,6 +131,7 @@ def _template_values(
         "trust": read_trust(stages),
         "curves": draw_training_curves(stages, metrics),
         "decisions": read_decisions(stages["train"]), "damaged": damaged,
+        "delivered": delivered_model(metrics),
         "scores": build_scores(metrics) if metrics and metrics.models else None,
         "sweep": draw_prune_curve(root, stages), "rounds": draw_rounds(stages["prune"]),
         "sweep_command": f"recon prune --sweep -w {shlex.quote(str(root))}",

@@ -45,7 +45,7 @@ function views() {
   const film = by("film"), frame = by("frame"), slide = by("slide"), toggle = by("difference");
   const shots = [...film.children];
   const radios = [...document.querySelectorAll("input[name=model]")];
-  const state = { view: 0, model: radios[0].value, difference: false };
+  const state = { view: 0, model: (radios.find((radio) => radio.checked) || radios[0]).value, difference: false };
   let order = [];
 
   // worst first for the model that is shown

@@ -13,24 +13,23 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
-from recon_cli.workspace.export_formats import EXPORT_FORMATS, READ_ONLY, ExportFormat
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, READABLE, ExportFormat
 
 logger = logging.getLogger("recon")
 
 FORMATS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
-_READABLE: dict[str, SplatFormat] = {**FORMATS, **{
-    row.name: import_module(row.module).FORMAT for row in READ_ONLY.values()}}
+_READERS: dict[str, SplatFormat] = {
+    row.name: import_module(row.module).FORMAT for row in READABLE}
 
 
 def format_of(path: Path) -> ExportFormat:
     """Returns the row of a file by the end of its name; FormatError if there is no such row."""
-    rows = [{**EXPORT_FORMATS, **READ_ONLY}[name] for name in _READABLE]
-    found = [row for row in rows if row.fits_name(path.name)]
+    found = [row for row in READABLE if row.fits_name(path.name)]
     if not found:
         raise FormatError(
             f"{path} is not of a known format of Gaussians.",
-            hint=f"Known are {', '.join(row.ending for row in rows)}.")
+            hint=f"Known are {', '.join(row.ending for row in READABLE)}.")
     return max(found, key=lambda row: len(row.ending))  # .compressed.ply before .ply
 
 
@@ -75,7 +74,7 @@ def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:
     row = format_of(path)
     if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
         raise FormatError(f"{path} is not a file.", hint="Give a file on the disk.")
-    form = _READABLE[row.name]
+    form = _READERS[row.name]
     try:
         if axes is None:
             return form.load(path)

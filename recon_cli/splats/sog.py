@@ -30,7 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.machine import usable_threads
 from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
 from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
@@ -394,7 +393,7 @@ def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> 
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
         archive.writestr(zipfile.ZipInfo(META, _DATE), text)
-        with ThreadPoolExecutor(usable_threads()) as pool:
+        with ThreadPoolExecutor(2) as pool:  # more take memory for little
             for name, encoded in zip(images, pool.map(encode_webp, images.values()), strict=True):
                 archive.writestr(zipfile.ZipInfo(name, _DATE), encoded)
     return data.getvalue()

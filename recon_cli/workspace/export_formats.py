@@ -90,6 +90,9 @@ READ_ONLY: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad"),
 )}
 
+READABLE: tuple[ExportFormat, ...] = (  # all that Gaussians are read from
+    *(row for row in EXPORT_FORMATS.values() if row.kind == "gaussians"), *READ_ONLY.values())
+
 
 def describe_max_loss() -> str:
     """Returns how many dB a format may lose unless --max-loss is given, for the help."""

@@ -39,7 +39,7 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     text.write_text(f"mine\n{outputs.BEGIN}\n{outputs.END}\nmine too\n")
     words = ["bench", "--quick", "--rounds", "1", "--threads", "1", "--device", "cpu",
              "--gaussians", "300", "--size", "64x48"]
-    assert main([*words, "--json", str(figures), "--markdown", str(text)]) == 0
+    assert main([*words, "--out", str(figures), "--markdown", str(text)]) == 0
     out = capsys.readouterr().out
     record = json.loads(figures.read_text())
     scene = record["scenes"]["room"]
@@ -71,7 +71,9 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     (["--markdown", "plain.md"], 3, "recon bench: begin"),
     (["--compare", "none.json"], 3, "cannot be read"),
     (["--compare", "other.json"], 3, "has the schema none"),
-    (["--json", "none/a.json"], 3, "does not exist"),
+    (["--out", "none/a"], 3, "does not exist"),
+    (["--json", "none/a.json"], 3, "does not exist"),  # as it was once called
+    (["--json=none/a.json"], 3, "does not exist"),
     (["--rounds", "0"], 2, "--rounds"),
 ])
 def test_what_cannot_be_done_is_refused_before_anything_is_measured(

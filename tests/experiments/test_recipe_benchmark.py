@@ -79,7 +79,7 @@ def test_the_command_writes_curves_tables_and_the_picture(tmp_path: Path, capsys
     text.write_text(f"{outputs.BEGIN}\n{outputs.END}\n")
     words = ["bench", "train", "--recipes", "reference,paper", "--iterations", "20", "--seeds", "2",
              "--max-size", "32", "--max-gaussians", "200", "--threads", "1", "--device", "cpu",
-             "--json", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.svg"),
+             "--out", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.svg"),
              "--markdown", str(text), "--target-db", "5", "--target-db", "90",
              "--scenes", str(tmp_path / "room")]
     assert main(words) == 0

@@ -271,7 +271,7 @@ def test_a_file_is_described_by_what_it_holds(tmp_path: Path) -> None:
     text = "\n".join(found.problems)
     assert "1 of 404 Gaussians have a scale of 0" in text
     assert "1 of 404 rotations are 0 0 0 0" in text
-    assert "1 of 404 quaternions are not of length 1" in text
+    assert "length" not in text  # of quaternions, which is 1 in few files
     assert "404, degree 0" in found.describe()
 
 

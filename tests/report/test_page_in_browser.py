@@ -132,29 +132,29 @@ def test_views_are_worst_first_for_the_model_that_is_shown(workspace, page):
     opened(workspace, page, at="#views")
     base, pruned = by_psnr(workspace, "base"), by_psnr(workspace, "pruned")
     assert base == pruned[::-1]
+    assert names(page) == pruned  # that which is delivered comes first
+    assert f"1 of 3: {pruned[0]}, PSNR 28.00 dB" in page.page.locator("#caption").inner_text()
+    page.page.get_by_text("original", exact=True).locator("visible=true").first.click()
     assert names(page) == base
-    assert f"1 of 3: {base[0]}, PSNR 20.00 dB" in page.page.locator("#caption").inner_text()
-    page.page.get_by_text("compact", exact=True).locator("visible=true").first.click()
-    assert names(page) == pruned
-    assert "PSNR 30.00 dB" in page.page.locator("#caption").inner_text()  # the same view
+    assert "PSNR 22.00 dB" in page.page.locator("#caption").inner_text()  # the same view
     page.page.keyboard.press("m")
-    assert names(page) == base
+    assert names(page) == pruned
 
 
 def test_models_have_renders_of_their_own(workspace, page):
     paint(workspace, truth=255, render=0)
-    for path in (workspace / "evaluate" / "renders" / "pruned").iterdir():
+    for path in (workspace / "evaluate" / "renders" / "base").iterdir():
         write_png(path, np.full((36, 48, 3), 255, np.uint8))
     opened(workspace, page, at="#views")
     assert fraction_dark(page) == pytest.approx(0.5, abs=0.03)
     page.page.keyboard.press("m")
     assert fraction_dark(page) < 0.03
-    assert page.page.locator("#side").inner_text() == "render, compact"
+    assert page.page.locator("#side").inner_text() == "render, original"
 
 
 def test_views_are_turned_by_keys_buttons_and_clicks(shown, workspace):
     shown.page.click("#tab-views")
-    order = by_psnr(workspace, "base")
+    order = by_psnr(workspace, "pruned")
     current = shown.page.locator(".shot[aria-current=true] .shot-name")
     assert current.inner_text() == order[0]
     shown.page.keyboard.press("n")
