@@ -39,7 +39,7 @@ def main() -> None:
     for name, pairs in times.items():
         cpu, wall = (min(column) for column in zip(*pairs, strict=True))
         click.echo(f"{name:32} {cpu:8.3f} CPU s {slowest / cpu:6.1f}x   {wall:8.3f} s "
-              f"{slow_wall / wall:6.1f}x")
+                   f"{slow_wall / wall:6.1f}x")
 
 
 def candidates(gaussians: int, cameras: int) -> dict[str, Callable[[], None]]:

@@ -336,6 +336,7 @@ def test_what_cannot_be_done_is_said(changes, error, hint) -> None:
     assert hint in caught.value.hint
 
 
+@pytest.mark.integration
 def test_the_test_scene_of_gsplat_agrees_with_float64(shared_data) -> None:
     """Every tenth Gaussian of its garden at a quarter of the size, in its three views."""
     with np.load(shared_data / "gsplat_garden" / "test_garden.npz", allow_pickle=False) as held:
