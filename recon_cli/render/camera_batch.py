@@ -10,6 +10,8 @@ only afterwards which Gaussians were drawn, and their projected means have a gra
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -87,11 +89,11 @@ class Batch:
         self._anchor = inputs.means.new_zeros(()).requires_grad_(self._differentiable)
         poses = inputs.viewmats.detach().double().cpu().numpy()
         intrinsics = inputs.Ks.detach().double().cpu().numpy()
-        with torch.set_grad_enabled(self._differentiable):
-            log_scales = _Log.apply(self._leaves.scales)  # type: ignore[no-untyped-call]
-            log_scales = log_scales + math.log(options.enlargement)
+        self._backend = options.backend
+        with torch.set_grad_enabled(self._differentiable), _one_torch_thread(self._backend):
+            shared = _Shared.from_leaves(self._leaves, options)
             self.views = [
-                _render_view(self._leaves, log_scales, c, numbers, options, self._anchor)
+                _render_view(self._leaves, shared, c, numbers, options, self._anchor)
                 for c, numbers in enumerate(zip(poses, intrinsics, strict=True))]
             self._images = torch.stack([view.image for view in self.views])
             self._alphas = torch.stack([view.alpha for view in self.views])[..., None]
@@ -135,15 +137,34 @@ class Batch:
     ) -> tuple[Tensor, list[Tensor | None]]:
         """Returns the gradients of the projected means, as arranged, and of the inputs."""
         wanted = [x for x in self._leaves if x.requires_grad]
-        *found, _ = torch.autograd.grad(
-            [self._images, self._alphas], [*wanted, self._anchor], [grad_images, grad_alphas],
-            retain_graph=True, allow_unused=True)
+        with _one_torch_thread(self._backend):
+            *found, _ = torch.autograd.grad(
+                [self._images, self._alphas], [*wanted, self._anchor], [grad_images, grad_alphas],
+                retain_graph=True, allow_unused=True)
         by_means2d = torch.cat([
             torch.stack([tap.means2d_grad[view.ids] for tap in view.taps]).sum(0)
             for view in self.views])
         gradients = iter(found)
         arranged = self.arrange(by_means2d)
         return arranged, [next(gradients) if x.requires_grad else None for x in self._leaves]
+
+
+@contextmanager
+def _one_torch_thread(backend: str) -> Iterator[None]:
+    """Leaves the cores to the threads of numba's kernels: those of torch spin while they wait."""
+    threads = torch.get_num_threads()
+    if backend != "numba" or threads == 1:
+        yield
+        return
+    from recon_cli.kernels.thread_pool import pool
+
+    before, pool.threads = pool.threads, pool.size
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        pool.threads = before
 
 
 class _Link(torch.autograd.Function):
@@ -212,38 +233,65 @@ class _Tap(torch.autograd.Function):
         return None, gradient, *by_view, torch.zeros_like(gradient[:0].sum())
 
 
+@dataclass(frozen=True, eq=False)
+class _Channels:
+    """Up to three channels in the form that backends take."""
+
+    sh_dc: Tensor  # [N, 3]
+    sh_rest: Tensor  # [N, T, 3]; [0, 0, 3] of plain colours
+    degree: int
+    count: int
+    shift: Tensor  # [count] that the image has too much
+    start: int  # the first of them among all channels
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """What all cameras have in common, in the form that backends take."""
+
+    means: Tensor  # [N, 3] in the enlarged world
+    log_scales: Tensor  # [N, 3] likewise
+    logits: Tensor | None  # [N]; None where each camera has its own
+    channels: list[_Channels] | None  # likewise
+
+    @staticmethod
+    def from_leaves(leaves: Gaussians, options: BatchOptions) -> _Shared:
+        """Computes them: once, not once for each camera."""
+        grown, plain = options.enlargement, 2 if options.sh_degree is None else 3
+        log_scales = _Log.apply(leaves.scales)  # type: ignore[no-untyped-call]
+        return _Shared(
+            leaves.means * grown, log_scales + math.log(grown),
+            None if options.antialiased
+            else _Logit.apply(leaves.opacities),  # type: ignore[no-untyped-call]
+            _split(leaves.colors, options) if leaves.colors.dim() == plain else None)
+
+
 def _render_view(
-    leaves: Gaussians, log_scales: Tensor, c: int,
+    leaves: Gaussians, shared: _Shared, c: int,
     numbers: tuple[NDArray[np.float64], NDArray[np.float64]], options: BatchOptions, anchor: Tensor,
 ) -> View:
     """Returns what camera `c` sees; `numbers` are its viewmat and K."""
     camera = TensorCamera(options.width, options.height, leaves.viewmats[c], leaves.Ks[c])
-    opacities = leaves.opacities
-    if options.antialiased:
-        opacities = opacities * compensations(leaves, camera, options.eps2d)
-    hidden = _hidden(leaves, camera, opacities, options)
-    if hidden is not None:
-        opacities = torch.where(hidden, 0.0, opacities)
-    logits = _Logit.apply(opacities)  # type: ignore[no-untyped-call]
+    logits = _logits(leaves, shared, camera, options)
     grown = options.enlargement
     growth = leaves.viewmats.new_ones(4, 4)  # a similarity on both sides: the last row shrinks
     growth[:3, 3], growth[3, :3] = grown, 1 / grown
     scaled = TensorCamera(camera.width, camera.height, camera.viewmat * growth, camera.intrinsics)
     seen_by = _ViewCamera.from_numbers(*numbers, options.width, options.height, grown)
-    per_camera = leaves.colors.dim() == (4 if options.sh_degree is not None else 3)
-    passes = _passes(
-        leaves.colors[c] if per_camera else leaves.colors, leaves.backgrounds[c], options)
     images, taps, first = [], [], None
-    for colors in passes:
-        tap = Tap(scaled, options.eps2d, sh_degree=colors.degree)
+    for part in shared.channels or _split(leaves.colors[c], options):
+        tap = Tap(scaled, options.eps2d, sh_degree=part.degree)
         means = _Tap.apply(  # type: ignore[no-untyped-call]
-            tap, leaves.means * grown, scaled.viewmat, scaled.intrinsics, anchor)
-        splats = Splats(means, leaves.quats, log_scales, logits, colors.sh_dc, colors.sh_rest)
-        output = _render(splats, seen_by, colors, options)
+            tap, shared.means, scaled.viewmat, scaled.intrinsics, anchor)
+        splats = Splats(
+            means, leaves.quats, shared.log_scales, logits, part.sh_dc, part.sh_rest)
+        behind = leaves.backgrounds[c, part.start:part.start + part.count] + part.shift
+        output = _render(splats, seen_by, torch.nn.functional.pad(behind, (0, 3 - part.count)),
+                         part.degree, options)
         tap.splats, tap.statistics = splats.map(torch.Tensor.detach), output.statistics
         output.statistics.keep_ellipses = (
             leaves.viewmats.requires_grad or leaves.Ks.requires_grad)
-        images.append(output.rgb[..., :colors.channels] - colors.shift)
+        images.append(output.rgb[..., :part.count] - part.shift)
         taps.append(tap)
         first = first or output
     assert first is not None
@@ -253,37 +301,37 @@ def _render_view(
     return View(torch.cat(images, dim=-1), first.alpha, ids, taps)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pass:
-    """Up to three channels in the form that backends take."""
+def _logits(
+    leaves: Gaussians, shared: _Shared, camera: TensorCamera, options: BatchOptions
+) -> Tensor:
+    """Returns the opacities as one camera sees them, [N], before the sigmoid."""
+    opacities = leaves.opacities
+    if options.antialiased:
+        opacities = opacities * compensations(leaves, camera, options.eps2d)
+    hidden = _hidden(leaves, camera, opacities, options)
+    if hidden is not None:
+        opacities = torch.where(hidden, 0.0, opacities)
+    elif shared.logits is not None:
+        return shared.logits
+    logits: Tensor = _Logit.apply(opacities)  # type: ignore[no-untyped-call]
+    return logits
 
-    sh_dc: Tensor  # [N, 3]
-    sh_rest: Tensor  # [N, T, 3]; [0, 0, 3] of plain colours
-    degree: int
-    channels: int
-    shift: Tensor  # [channels] that the image has too much
-    background: Tensor  # [3]
 
-
-def _passes(colors: Tensor, background: Tensor, options: BatchOptions) -> list[_Pass]:
-    """Returns the passes for colours [N, D] or coefficients [N, K, 3] of one camera."""
-    zero = background.new_zeros(3)
-    rest = colors.new_zeros(0, 0, 3)
+def _split(colors: Tensor, options: BatchOptions) -> list[_Channels]:
+    """Returns the passes for colours [N, D] or coefficients [N, K, 3]."""
+    none, rest = colors.new_zeros(0), colors.new_zeros(0, 0, 3)
     if not options.color:  # the depth alone
-        return [_Pass(colors.new_zeros(len(colors), 3), rest, 0, 0, zero[:0], zero)]
+        return [_Channels(colors.new_zeros(len(colors), 3), rest, 0, 0, none, 0)]
     if options.sh_degree is not None:
-        used = (options.sh_degree + 1) ** 2
-        return [_Pass(
-            colors[:, 0], colors[:, 1:used], options.sh_degree, 3, zero, background)]
+        dc, used = colors[:, 0], colors[:, 1:(options.sh_degree + 1) ** 2]
+        return [_Channels(
+            dc.contiguous(), used.contiguous(), options.sh_degree, 3, colors.new_zeros(3), 0)]
     passes = []
     for start in range(0, colors.shape[1], 3):
         part = colors[:, start:start + 3]
-        missing = 3 - part.shape[1]
-        shift = _shift(part)
-        passes.append(_Pass(
-            torch.nn.functional.pad((part + (shift - 0.5)) / SH_C0, (0, missing)), rest, 0,
-            part.shape[1], shift,
-            torch.nn.functional.pad(background[start:start + 3] + shift, (0, missing))))
+        shift, count = _shift(part), part.shape[1]
+        dc = torch.nn.functional.pad((part + (shift - 0.5)) / SH_C0, (0, 3 - count))
+        passes.append(_Channels(dc, rest, 0, count, shift, start))
     return passes
 
 
@@ -300,15 +348,14 @@ def _shift(colors: Tensor) -> Tensor:
 
 
 def _render(
-    splats: Splats, camera: Camera, colors: _Pass, options: BatchOptions
+    splats: Splats, camera: Camera, background: Tensor, degree: int, options: BatchOptions
 ) -> RenderOutput:
     """Renders one pass."""
     if options.eps2d == DILATION:
-        return renderer(options.backend)(splats, camera, colors.background, colors.degree, False)
+        return renderer(options.backend)(splats, camera, background, degree, False)
     from recon_cli.render.torch.tiles import render as torch_render  # the others have a fixed one
 
-    return torch_render(
-        splats, camera, colors.background, colors.degree, False, dilation=options.eps2d)
+    return torch_render(splats, camera, background, degree, False, dilation=options.eps2d)
 
 
 class _ViewCamera(Camera):

@@ -87,6 +87,7 @@ class _Render(torch.autograd.Function):
         ctx: Any, background: Tensor, camera: Camera, settings: RenderSettings,
         statistics: Statistics, *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.set_materialize_grads(False)  # a loss of colours alone takes less
         size = camera.height, camera.width
         rgb, alpha, depth = (background.new_empty(*size, 3), background.new_empty(size),
                              background.new_empty(size))
@@ -102,14 +103,17 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def backward(
-        ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor, grad_depth: Tensor
+        ctx: Any, grad_rgb: Tensor | None, grad_alpha: Tensor | None, grad_depth: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        tensors = ctx.saved_tensors
+        tensors, nothing = ctx.saved_tensors, np.empty(0, np.float32)
+        grad_rgb = ctx.alpha.new_zeros(*ctx.alpha.shape, 3) if grad_rgb is None else grad_rgb
         gradients = [torch.empty_like(tensor, memory_format=torch.contiguous_format)
                      for tensor in tensors]
         ctx.lease.view_pass.backward(
             PackedSplats.from_tensors(tensors), PackedSplats.from_tensors(gradients),
-            ImageBuffers(flat(grad_rgb), flat(grad_alpha), flat(grad_depth)), ctx.statistics,
+            ImageBuffers(flat(grad_rgb), *(nothing if gradient is None else flat(gradient)
+                                           for gradient in (grad_alpha, grad_depth))),
+            ctx.statistics,
             details=True, loo=ctx.scores)
         if ctx.statistics.keep_ellipses:
             ctx.statistics.ellipses = ctx.lease.view_pass.ellipse_gradients()

@@ -252,7 +252,7 @@ class ViewPass:
             totals[:, GRAD_RED:GRAD_BLUE + 1].clone(), totals[:, GRAD_DEPTH].clone())
 
 
-_MOST_FREE = 2  # passes that are kept for their next use
+_MOST_FREE = 8  # passes that are kept for their next use: of views that are drawn together
 _free: list[ViewPass] = []
 _free_lock = threading.RLock()  # a Lease may be collected while one is made
 
