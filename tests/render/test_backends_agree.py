@@ -46,7 +46,7 @@ def everything(
     found |= {f"gradient of {name}": p.grad for name, p in tracked.parameters().items()
               if p.grad is not None}
     found |= {field.name: getattr(out.statistics, field.name) for field in fields(Statistics)
-              if field.name != "broken"}
+              if isinstance(getattr(out.statistics, field.name), torch.Tensor)}
     assert out.statistics.broken == 0
     return {name: value.detach().double().cpu() for name, value in found.items()}
 

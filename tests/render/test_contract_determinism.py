@@ -26,7 +26,7 @@ def everything(case, splats, camera):
     found = {"rgb": out.rgb, "alpha": out.alpha, "depth": out.depth}
     found |= {f"gradient of {name}": p.grad for name, p in tracked.parameters().items()}
     found |= {field.name: getattr(out.statistics, field.name) for field in fields(Statistics)
-              if field.name != "broken"}
+              if isinstance(getattr(out.statistics, field.name), torch.Tensor)}
     return {name: value.detach().cpu() for name, value in found.items()}
 
 
