@@ -48,10 +48,12 @@ check: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python docs/generate_cli.py --check
+	$(BIN)/python docs/generate_api.py --check
 
-# The CLI reference, and the manual as a site in build/docs. A link that leads nowhere fails.
+# The references, and the manual as a site in build/docs. A link that leads nowhere fails.
 docs: $(DEV)
 	$(BIN)/python docs/generate_cli.py
+	$(BIN)/python docs/generate_api.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from recon_cli.api.results import SfmResult as SfmResult
     from recon_cli.api.results import StageResult as StageResult
     from recon_cli.api.results import TrainingCurve as TrainingCurve
+    from recon_cli.api.results import View as View
     from recon_cli.api.scoring import Scores as Scores
     from recon_cli.api.scoring import evaluate as evaluate
     from recon_cli.api.splats import Splats as Splats
@@ -51,13 +52,20 @@ if TYPE_CHECKING:
     from recon_cli.errors import WorkspaceError as WorkspaceError
     from recon_cli.evaluation.scores import ModelMetrics as ModelMetrics
     from recon_cli.evaluation.scores import ViewScore as ViewScore
-    from recon_cli.io.views import ReferenceView as ReferenceView
     from recon_cli.pipeline.plan import StageStatus as StageStatus
     from recon_cli.progress import Bar as Bar
     from recon_cli.progress import NullProgress as NullProgress
     from recon_cli.progress import Progress as Progress
     from recon_cli.progress import TqdmProgress as TqdmProgress
     from recon_cli.scene.camera import Camera as Camera
+    from recon_cli.workspace.export_record import ExportSummary as ExportSummary
+    from recon_cli.workspace.summaries import DenoiseSummary as DenoiseSummary
+    from recon_cli.workspace.summaries import EvaluateSummary as EvaluateSummary
+    from recon_cli.workspace.summaries import ImportSummary as ImportSummary
+    from recon_cli.workspace.summaries import IngestSummary as IngestSummary
+    from recon_cli.workspace.summaries import PruneSummary as PruneSummary
+    from recon_cli.workspace.summaries import SfmSummary as SfmSummary
+    from recon_cli.workspace.summaries import TrainSummary as TrainSummary
 
 # Each module and the public names that are loaded from it, in the order of docs/api.md.
 _PUBLIC: dict[str, tuple[str, ...]] = {
@@ -70,8 +78,11 @@ _PUBLIC: dict[str, tuple[str, ...]] = {
     "recon_cli.api.workspace": ("Workspace",),
     "recon_cli.api.results": (
         "StageResult", "IngestResult", "SfmResult", "ModelResult", "TrainingCurve",
-        "EvaluateResult", "ExportResult"),
-    "recon_cli.io.views": ("ReferenceView",),
+        "EvaluateResult", "ExportResult", "View"),
+    "recon_cli.workspace.summaries": (
+        "IngestSummary", "DenoiseSummary", "SfmSummary", "TrainSummary", "ImportSummary",
+        "PruneSummary", "EvaluateSummary"),
+    "recon_cli.workspace.export_record": ("ExportSummary",),
     "recon_cli.pipeline.plan": ("StageStatus",),
     "recon_cli.config.stages": (
         "IngestConfig", "DenoiseConfig", "SfmConfig", "TrainConfig", "PruneConfig",

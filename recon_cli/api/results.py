@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.evaluation.scores import Metrics, ModelMetrics
-from recon_cli.io.colmap import read_points
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.json_record import JsonRecord
@@ -24,8 +22,9 @@ from recon_cli.workspace.summaries import (
     SfmSummary,
 )
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # they import torch, SciPy or pycolmap
     from recon_cli.api.splats import Splats
+    from recon_cli.evaluation.scores import ModelMetrics
 
 S = TypeVar("S", bound=JsonRecord)
 
@@ -82,6 +81,8 @@ class SfmResult(StageResult[SfmSummary]):
 
     @cached_property
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        from recon_cli.io.colmap import read_points
+
         return read_points(self.folder / "undistorted" / "sparse" / "points3D.bin")
 
 
@@ -134,6 +135,8 @@ class EvaluateResult(StageResult[EvaluateSummary]):
     @cached_property
     def metrics(self) -> Mapping[str, ModelMetrics]:
         """The scores of each model, base and pruned, and of its views."""
+        from recon_cli.evaluation.scores import Metrics
+
         return Metrics.read(self.folder).models
 
     @property
@@ -160,3 +163,13 @@ class ExportResult(StageResult[ExportSummary]):
         """The files, or folders of files, of the other formats that fit the .ply, by name."""
         return {name: self.folder / record.file
                 for name, record in (self.summary.files or {}).items() if not record.stale}
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An undistorted view of a capture with its pixels."""
+
+    name: str  # of its frame
+    camera: Camera  # at the size of the image
+    image: NDArray[np.uint8]  # [H, W, 3] RGB; one colour under the mask
+    mask: NDArray[np.bool_] | None  # [H, W], True where a pixel counts; None where all do

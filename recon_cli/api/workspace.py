@@ -19,6 +19,7 @@ from recon_cli.api.results import (
     ModelResult,
     SfmResult,
     StageResult,
+    View,
 )
 from recon_cli.api.runs import OpenWorkspace, RunRequest, check_settings, make_options
 from recon_cli.config.fields import StageConfig
@@ -50,7 +51,6 @@ from recon_cli.workspace.summaries import (
 
 if TYPE_CHECKING:  # they import torch
     from recon_cli.api.splats import Splats
-    from recon_cli.io.views import ReferenceView
 
 R = TypeVar("R", bound=StageResult[Any])
 
@@ -178,8 +178,8 @@ class Workspace:
         trained = open_trained_scene(self._job(), model)
         return Splats.from_scene(trained.splats, up="z" if trained.z_up else None)
 
-    def views(self, split: str = "train", *, max_size: int | None = None) -> list[ReferenceView]:
-        """Returns the undistorted views with their pixels: name, camera, image, mask.
+    def views(self, split: str = "train", *, max_size: int | None = None) -> list[View]:
+        """Returns the undistorted views with their original pixels.
 
         Args:
             split: train, validation or test; gradients may come from train alone, decisions from
@@ -208,7 +208,8 @@ class Workspace:
             validation=config.validation if run_config is None else run_config.validation)
         size = max_size or (run_config.max_size if run_config else
                             config.max_size or QUALITIES[config.quality].max_size)
-        return load_views(getattr(scene, split), size, "left out", logger.warning)
+        return [View(view.name, view.camera, view.image, view.mask) for view in load_views(
+            getattr(scene, split), size, "left out", logger.warning)]
 
     def _job(self) -> Job:
         return self._open.open_job(ComputeConfig)[0]

@@ -105,6 +105,11 @@ class Camera:
             raise ValueError(f"viewmat has shape {self.viewmat.shape}, needed (4, 4)")
 
     @property
+    def K(self) -> NDArray[np.float64]:  # noqa: N802  # the field's name
+        """The intrinsics as a matrix, [3, 3] in pixels."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    @property
     def center(self) -> NDArray[np.float64]:
         """The optical centre in world coordinates, [3]."""
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])

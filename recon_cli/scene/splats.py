@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -57,12 +57,12 @@ class Splats:
             if tensor.dtype != self.means.dtype or tensor.device != self.means.device:
                 raise ValueError(f"{name} differs from means in dtype or device")
 
-    @staticmethod
+    @classmethod
     def from_parameters(
-        parameters: Mapping[str, Tensor], backdrop: Backdrop | None = None
-    ) -> Splats:
+        cls, parameters: Mapping[str, Tensor], backdrop: Backdrop | None = None
+    ) -> Self:
         """Returns splats of the raw parameters by name; ValueError where shapes disagree."""
-        return Splats(*(parameters[name] for name in PARAMETERS), backdrop=backdrop)
+        return cls(*(parameters[name] for name in PARAMETERS), backdrop=backdrop)
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -105,7 +105,7 @@ class Splats:
         """Returns the splats with coefficients of this degree: cut, or filled up with zeros."""
         return replace(self, sh_rest=with_terms(self.sh_rest, TERMS[degree]))
 
-    def with_sphere(self, largest: float = math.inf) -> Splats:
+    def with_sphere(self, largest: float = math.inf) -> Self:
         """Returns the splats with their backdrop as Gaussians, behind all others and last.
 
         Where a file holds scales up to `largest` only, there are more of them.
@@ -114,11 +114,12 @@ class Splats:
             return self
         positions, scale = self.backdrop.sphere(self.means.detach().cpu().numpy(), largest)
         n, values = len(positions), self.means.new_tensor
-        sphere = Splats(
-            values(positions), values([[1.0, 0, 0, 0]]).repeat(n, 1),
-            values([[math.log(scale)] * 3]).repeat(n, 1),
-            torch.logit(values([SPHERE_OPACITY])).repeat(n),
-            ((values([self.backdrop.color]) - 0.5) / SH_C0).repeat(n, 1), self.sh_rest[:0])
+        sphere = replace(
+            self, means=values(positions), quats=values([[1.0, 0, 0, 0]]).repeat(n, 1),
+            log_scales=values([[math.log(scale)] * 3]).repeat(n, 1),
+            logit_opacities=torch.logit(values([SPHERE_OPACITY])).repeat(n),
+            sh_dc=((values([self.backdrop.color]) - 0.5) / SH_C0).repeat(n, 1),
+            sh_rest=self.sh_rest[:0], backdrop=None)
         return joined([replace(self, backdrop=None), sphere])[0]
 
     @property
@@ -143,6 +144,7 @@ class Splats:
         return torch.sigmoid(self.logit_opacities)
 
 
+S = TypeVar("S", bound=Splats)
 PARAMETERS = tuple(item.name for item in fields(Splats) if item.name != "backdrop")
 
 
@@ -160,7 +162,7 @@ def with_rows(sh_rest: Tensor, rows: int) -> Tensor:
     return torch.cat([sh_rest, missing])
 
 
-def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
+def joined(parts: Sequence[S]) -> tuple[S, Tensor]:
     """Returns the Gaussians of all parts, those with coefficients first, and their order.
 
     The order is the row [N] of each in the plain concatenation of the parts. The backdrop is
@@ -177,8 +179,9 @@ def joined(parts: Sequence[Splats]) -> tuple[Splats, Tensor]:
     together = {name: torch.cat([part.parameters()[name] for part in parts])
                 for name in parts[0].parameters()}
     rest = together.pop("sh_rest")  # in that order already
-    rows = {name: value[order] for name, value in together.items()} | {"sh_rest": rest}
-    return Splats.from_parameters(rows, enclosing([part.backdrop for part in parts])), order
+    rows: dict[str, Any] = {name: value[order] for name, value in together.items()}
+    backdrop = enclosing([part.backdrop for part in parts])
+    return replace(parts[0], **rows, sh_rest=rest, backdrop=backdrop), order
 
 
 def transformed(splats: Splats, similarity: Similarity) -> Splats:

@@ -41,6 +41,17 @@ def test_arrays_make_the_same_gaussians_again() -> None:
     assert not (splats.means == 7).any()
 
 
+def test_the_backdrop_becomes_gaussians_that_can_be_written(tmp_path) -> None:
+    splats = one_gaussian(backdrop=Backdrop(0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 5.0))
+    assert len(splats.arrays()["means"]) == 1
+    whole = splats.with_sphere()
+    assert whole.backdrop is None
+    np.testing.assert_allclose(
+        (whole.arrays()["sh"][1:, 0] * SH_C0 + 0.5).mean(axis=0), [0.1, 0.2, 0.3], atol=1e-5)
+    whole.write(tmp_path / "whole.ply")
+    assert len(Splats.read(tmp_path / "whole.ply")) == len(whole) > 1
+
+
 def test_gaussians_without_coefficients_have_zeros_in_sh() -> None:
     splats = Splats.from_scene(edge_splats(2, colored=100))
     assert splats.sh.shape == (len(splats), 9, 3)

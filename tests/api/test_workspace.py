@@ -9,6 +9,7 @@ import fake_stages
 import numpy as np
 import pytest
 import torch
+from tiny_room import TINY, write_options
 
 from recon_cli import cli
 from recon_cli.api import (
@@ -25,14 +26,6 @@ from recon_cli.api import (
     workspace,
 )
 from recon_cli.workspace import layout
-
-TINY = {
-    "ingest": {"frames": 16, "max_size": 320},
-    "sfm": {"max_features": 1500, "accept_weak": True, "min_registered": 0.3},
-    "train": {"iterations": 60, "max_size": 160, "max_gaussians": 3000, "far": "off",
-              "exposure": "off", "images": "original", "sh_degree": 1},
-    "prune": {"rounds": 1, "recovery": 10},
-}
 
 
 @pytest.fixture
@@ -158,10 +151,7 @@ def test_a_capture_from_python_is_that_of_the_commands(
     assert torch.get_num_threads() == threads
     assert capfd.readouterr() == ("", "")
     # the same by commands: the same results, and each takes those of the other for fresh
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "recon.toml").write_text("".join(
-        f"[{section}]\n" + "".join(f"{name} = {toml(value)}\n" for name, value in values.items())
-        for section, values in TINY.items()))
+    write_options(tmp_path / "other")
     at = ["-w", str(tmp_path / "other")]
     for command in (["ingest", str(sample_video)], ["train"], ["prune", "--ratio", "0.5"]):
         assert cli.main([*command, *at]) == 0
@@ -171,7 +161,3 @@ def test_a_capture_from_python_is_that_of_the_commands(
     assert not Workspace(tmp_path / "other").prune(ratio=0.5).ran
     np.testing.assert_array_equal(Workspace(tmp_path / "other").splats("base").means,
                                   trained.splats.means)
-
-
-def toml(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else repr(value).replace("'", '"')
