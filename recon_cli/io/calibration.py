@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.camera import MODELS, Lens, make_lens
+from recon_cli.scene.camera import Lens, make_lens
 
 # Entries of three decimals are off by 5e-4, so R R^T by up to 2 * sqrt(3) * 5e-4 = 1.7e-3.
 ORTHONORMAL = 2e-3
@@ -106,45 +105,26 @@ def lens_from_matrix(matrix: NDArray[np.float64], width: int, height: int, where
     return make_lens("PINHOLE", width, height, params, where)
 
 
-_PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE")
-_PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
-# Each step shrinks the error by about the distortion itself: 50 undo 50% to 1e-15.
-_STEPS = 50
+# Pixels by which a ray that is projected again may miss. COLMAP's inversion of a fisheye ends far
+# from the solution for some pixels towards the edge.
+_MISS = 0.01
 
 
 def undistort_pixels(
     lens: Lens,
     pixels: NDArray[np.float64],  # [M, 2]
 ) -> NDArray[np.float64]:
-    """Returns [M, 2] undistorted x/z and y/z of pixels; ValueError for a THIN_PRISM_FISHEYE."""
-    focals, _ = MODELS[lens.model]
-    focal = np.array([lens.params[0], lens.params[focals - 1]])
-    distorted = (pixels - lens.params[focals:focals + 2]) / focal
-    coefficients = lens.params[focals + 2:]
-    if lens.model in _PINHOLE or not len(pixels):
-        return np.asarray(distorted)
-    if lens.model in _PERSPECTIVE:
-        return _undo(distorted, np.array([*coefficients, *[0.0] * (8 - len(coefficients))]))
-    if lens.model not in _FISHEYE:
-        raise ValueError(f"{lens.model} cannot be undone")
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, 1e-12)
-    padded = np.array([*coefficients, *[0.0] * (4 - len(coefficients))])
-    undone = cv2.fisheye.undistortPoints(
-        np.ascontiguousarray(distorted)[:, None], np.eye(3), padded, criteria=stop)
-    return np.asarray(undone, np.float64)[:, 0]
+    """Returns [M, 2] undistorted x/z and y/z of pixels, by COLMAP.
 
+    NaN where there are none: of a direction at right angles to the axis or behind the camera, or
+    of a pixel that no direction is shown at.
+    """
+    # `recon convert` reads poses too, and starts without it
+    from recon_cli.io.colmap_library import pycolmap
 
-def _undo(distorted: NDArray[np.float64], k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverts k1 k2 p1 p2 k3 k4 k5 k6 by the fixed point that cv2.undistortPoints iterates."""
-    # Not OpenCV, whose default of five steps leaves 0.04 pixels at the corners for k1 = -0.28.
-    k1, k2, p1, p2, k3, k4, k5, k6 = k
-    undone = distorted.copy()
-    for _ in range(_STEPS):
-        x, y = undone.T
-        r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        shift = np.stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                          p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=1)
-        undone = (distorted - shift) / radial[:, None]
-    return undone
+    camera = pycolmap.Camera(
+        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+    undone = np.array(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
+    again = np.array(camera.img_from_cam(np.column_stack([undone, np.ones(len(undone))])))
+    found = np.abs(again.reshape(-1, 2) - pixels).max(axis=1, initial=0.0) <= _MISS
+    return np.where(found[:, None], undone, np.nan)

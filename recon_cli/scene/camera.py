@@ -19,7 +19,9 @@ MODELS: dict[str, tuple[int, int]] = {
     PANORAMA: (0, 2),
     "SIMPLE_PINHOLE": (1, 3), "PINHOLE": (2, 4), "SIMPLE_RADIAL": (1, 4), "RADIAL": (1, 5),
     "OPENCV": (2, 8), "OPENCV_FISHEYE": (2, 8), "FULL_OPENCV": (2, 12),
-    "SIMPLE_RADIAL_FISHEYE": (1, 4), "RADIAL_FISHEYE": (1, 5), "THIN_PRISM_FISHEYE": (2, 12)}
+    "SIMPLE_RADIAL_FISHEYE": (1, 4), "RADIAL_FISHEYE": (1, 5), "THIN_PRISM_FISHEYE": (2, 12),
+    "FOV": (2, 5), "RAD_TAN_THIN_PRISM_FISHEYE": (2, 16), "SIMPLE_DIVISION": (1, 4),
+    "DIVISION": (2, 5), "SIMPLE_FISHEYE": (1, 3), "FISHEYE": (2, 4), "EUCM": (2, 6)}
 MAX_SIDE = 1 << 16  # pixels; no image format in use holds a longer side
 
 

@@ -79,7 +79,7 @@ def test_a_skewed_matrix_is_refused():
 
 @pytest.mark.parametrize(("model", "size", "params", "said"), [
     ("PINHOLE", (4, 4), (1, 1, 2), "takes 4 parameters, but there are 3"),
-    ("FOV", (4, 4), (1, 1, 2, 2, 0), "camera model FOV"),
+    ("LENS", (4, 4), (1, 1, 2, 2, 0), "camera model LENS"),
     ("PINHOLE", (4, 4), (1, float("nan"), 2, 2), "not finite"),
     ("PINHOLE", (4, 4), (1, 0, 2, 2), "no camera"),
     ("PINHOLE", (0, 4), (1, 1, 2, 2), "no camera"),

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from recon_cli.io.calibration import undistort_pixels
-from recon_cli.scene.camera import Lens
+from recon_cli.scene.camera import MODELS, Lens
 
 K = np.array([[400.0, 0, 320.5], [0, 410, 240.25], [0, 0, 1]])
 INNER = (400.0, 410.0, 320.5, 240.25)
@@ -50,6 +50,29 @@ def test_a_fisheye_is_undone(model, coefficients):
     np.testing.assert_allclose(undistort_pixels(lens, pixels), RAYS, atol=1e-7)
 
 
-def test_a_lens_that_nothing_undoes_is_refused():
-    with pytest.raises(ValueError, match="THIN_PRISM_FISHEYE"):
-        undistort_pixels(Lens("THIN_PRISM_FISHEYE", 4, 4, (1.0,) * 12), np.zeros((1, 2)))
+def test_every_model_of_colmap_is_known_and_undone_or_said_to_have_no_direction():
+    pycolmap = pytest.importorskip("pycolmap")
+    pixels = np.stack(np.meshgrid([140.0, 320, 500], [90.0, 240, 390]), axis=-1).reshape(-1, 2)
+    for name, number in pycolmap.CameraModelId.__members__.items():
+        if name in ("INVALID", "EQUIRECTANGULAR"):
+            continue
+        camera = pycolmap.Camera.create_from_model_id(1, number, 400.0, 640, 480)
+        focals, count = MODELS[name]
+        assert (len(camera.focal_length_idxs()), len(camera.params)) == (focals, count), name
+        assert list(camera.principal_point_idxs()) == [focals, focals + 1], name
+        rays = undistort_pixels(Lens(name, 640, 480, tuple(camera.params)), pixels)
+        again = camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+        np.testing.assert_allclose(again, pixels, atol=0.01)
+
+
+def test_a_pixel_whose_direction_is_not_found_has_none():
+    """The corner of a fisheye that shows 193 degrees from corner to corner."""
+    lens = Lens("OPENCV_FISHEYE", 960, 720, (340, 343, 486, 356, 0.03, -0.006, 0.001, -0.0001))
+    rays = undistort_pixels(lens, np.array([[1.0, 1.0], [486.0, 356.0], [826.0, 356.0]]))
+    assert np.isnan(rays[0]).all()
+    np.testing.assert_array_equal(rays[1], [0, 0])
+    assert rays[2][0] == pytest.approx(1.45, abs=0.1)  # 340 px, a radian less the distortion
+
+
+def test_no_pixels_have_no_rays():
+    assert undistort_pixels(Lens("PINHOLE", 4, 4, (1.0,) * 4), np.zeros((0, 2))).shape == (0, 2)
