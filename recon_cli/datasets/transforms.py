@@ -362,17 +362,26 @@ def _read_points(
     return points, colors, ()
 
 
+@dataclass(frozen=True)
+class DepthPaths:
+    """The files of depth, PNGs of 16 bits, by the paths of their images."""
+
+    files: Mapping[str, str]  # below the folder of the .json
+    unit: float  # world units of a value of 1
+
+
 def write_transforms(
     path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = (),
-    points: str | None = None,
+    points: str | None = None, depth: DepthPaths | None = None,
 ) -> None:
     """Writes the cameras of images, by paths below the folder of the file, atomically.
 
     Intrinsics that all cameras share are written once. With held-out paths the lists
     train_filenames, val_filenames and test_filenames are written; the last two are those images,
     because nerfstudio requires both. `points` is the name of a point cloud beside the file, in the
-    same world, where nerfstudio starts Gaussians. InputError if there are no views; ValueError if
-    a path leaves the folder, appears twice, or is held out but no view.
+    same world, where nerfstudio starts Gaussians; `depth` has a file for every image. InputError if
+    there are no views; ValueError if a path leaves the folder, appears twice, or is held out but no
+    view.
     """
     if not views:
         raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
@@ -387,12 +396,15 @@ def write_transforms(
     value: dict[str, Any] = {"camera_model": "PINHOLE", **(inner[0] if shared else {})}
     if points is not None:
         value["ply_file_path"] = points
+    if depth is not None:
+        value["depth_unit_scale_factor"] = depth.unit
     if held_out:
         test = [name for name in names if name in held_out]
         value |= {"train_filenames": [name for name in names if name not in held_out],
                   "val_filenames": test, "test_filenames": test}
     value["frames"] = [
         {"file_path": name, **({} if shared else intrinsics),
+         **({} if depth is None else {"depth_file_path": depth.files[name]}),
          "transform_matrix": pose_from_viewmat(camera.viewmat).tolist()}
         for (name, camera), intrinsics in zip(views, inner, strict=True)]
     write_json(path, value)

@@ -172,7 +172,7 @@ def test_intrinsics_of_another_size_are_scaled_or_refused(frames, tmp_path):
 def test_a_video_that_is_none_is_refused(frames, tmp_path):
     stray(tmp_path, frames)
     (tmp_path / "rgb.mp4").write_bytes((tmp_path / "rgb.mp4").read_bytes()[:900])
-    refused(tmp_path, "")
+    refused(tmp_path, "rgb.mp4")
 
 
 def test_times_without_a_match_are_left_out(frames, tmp_path):
