@@ -1,7 +1,7 @@
 """Masks of panoramas: the pole below the camera, and what moves along with it.
 
 Below a panorama are the tripod, a hand, or a patch that hides them. Whoever carries the camera
-stays in one place of each panorama, where colours vary less from one to the next than at the same
+stays in one place of each panorama, where colours change less from one to the next than at the same
 height elsewhere.
 """
 
@@ -22,12 +22,13 @@ from recon_cli.workspace import records as store
 # Degrees around the lowest point. The patches in 19 panoramas of a house reach up to 24 degrees.
 POLE_DEG = 25.0
 SIZE = (240, 120)  # at which colours are compared
-SMOOTH = 5  # pixels over which their deviations are averaged
+SMOOTH = 5  # pixels over which their changes are averaged
 MIN_PANORAMAS = 15  # fewer look alike by chance
-# Of the usual deviation at the same height: what certainly moves along, and what does where it
-# adjoins that. Of 30 panoramas of a room 0.02 to 0.5 where the operator stands; the lowest
-# hundredth elsewhere is 0.33 to 0.52 in two rooms and a house.
-CARRIED, ADJOINING = 0.25, 0.6
+# Of the usual change at the same height: what certainly moves along, and what does where it adjoins
+# that. Where an operator stands in two rooms it is .1 to .31, of a video .08; the lowest two
+# thousandths elsewhere are .3 and .42 there, and .43 in a house without one. To compare with the
+# median of all panoramas instead would not tell a lit operator from the room.
+CARRIED, ADJOINING = 0.25, 0.32
 LEAST = 60  # pixels of an area that is masked
 HIGHEST_DEG = 30.0  # above the horizon; ceilings are even
 GROW = 4  # pixels around it: cameras lean by some degrees
@@ -60,16 +61,18 @@ def pole_mask(width: int, height: int) -> NDArray[np.uint8]:
 
 
 def find_carried(panoramas: Sequence[Path]) -> NDArray[np.bool_] | None:
-    """Returns where panoramas show what moves along with the camera, at `SIZE`; None if nowhere."""
+    """Returns where panoramas show what moves along with the camera, at `SIZE`; None if nowhere.
+
+    They are in the order in which they were taken, as far as that is known.
+    """
     if len(panoramas) < MIN_PANORAMAS:
         return None
     colours = np.stack([_read_colours(path) for path in panoramas])
-    middle = np.median(colours, axis=0)
-    deviation = np.sqrt((np.median(np.abs(colours - middle), axis=0) ** 2).sum(axis=2))
-    wrapped = np.concatenate(
-        [deviation[:, -SMOOTH:], deviation, deviation[:, :SMOOTH]], axis=1)
-    deviation = cv2.blur(wrapped, (SMOOTH, SMOOTH))[:, SMOOTH:-SMOOTH]
-    share = deviation / np.maximum(np.median(deviation, axis=1, keepdims=True), 1e-6)
+    steps = np.median(np.abs(np.diff(colours, axis=0)), axis=0)
+    change = np.sqrt((steps**2).sum(axis=2))
+    wrapped = np.concatenate([change[:, -SMOOTH:], change, change[:, :SMOOTH]], axis=1)
+    change = cv2.blur(wrapped, (SMOOTH, SMOOTH))[:, SMOOTH:-SMOOTH]
+    share = change / np.maximum(np.median(change, axis=1, keepdims=True), 1e-6)
     share[:round((90 - HIGHEST_DEG) / 180 * SIZE[1])] = np.inf
     # twice beside itself, so that an area across the seam is one
     near = np.concatenate([share, share], axis=1) < ADJOINING
