@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from recon_cli.api.scoring import evaluate as evaluate
     from recon_cli.api.splats import Splats as Splats
     from recon_cli.api.workspace import Workspace as Workspace
+    from recon_cli.config.export import ExportConfig as ExportConfig
     from recon_cli.config.stages import ComputeConfig as ComputeConfig
     from recon_cli.config.stages import DenoiseConfig as DenoiseConfig
     from recon_cli.config.stages import EvaluateConfig as EvaluateConfig
-    from recon_cli.config.stages import ExportConfig as ExportConfig
     from recon_cli.config.stages import ImportConfig as ImportConfig
     from recon_cli.config.stages import IngestConfig as IngestConfig
     from recon_cli.config.stages import PruneConfig as PruneConfig
@@ -86,7 +86,8 @@ _PUBLIC: dict[str, tuple[str, ...]] = {
     "recon_cli.pipeline.plan": ("StageStatus",),
     "recon_cli.config.stages": (
         "IngestConfig", "DenoiseConfig", "SfmConfig", "TrainConfig", "PruneConfig",
-        "EvaluateConfig", "ExportConfig", "ImportConfig", "ComputeConfig"),
+        "EvaluateConfig", "ImportConfig", "ComputeConfig"),
+    "recon_cli.config.export": ("ExportConfig",),
     "recon_cli.context": ("TrainCallback", "TrainReport"),
     "recon_cli.progress": ("Progress", "Bar", "NullProgress", "TqdmProgress"),
     "recon_cli.errors": (

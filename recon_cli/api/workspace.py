@@ -22,12 +22,12 @@ from recon_cli.api.results import (
     View,
 )
 from recon_cli.api.runs import OpenWorkspace, RunRequest, check_settings, make_options
+from recon_cli.config.export import ExportConfig
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.stages import (
     ComputeConfig,
     DenoiseConfig,
     EvaluateConfig,
-    ExportConfig,
     ImportConfig,
     IngestConfig,
     PruneConfig,

@@ -14,7 +14,8 @@ import click
 from recon_cli.commands import options
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings as layers
-from recon_cli.config.stages import ComputeConfig, read_matrix
+from recon_cli.config.export import read_matrix
+from recon_cli.config.stages import ComputeConfig
 from recon_cli.errors import ConfigError, ReconError
 from recon_cli.progress import TqdmProgress
 

@@ -13,11 +13,11 @@ from recon_cli.commands.ending import end_run, name_workspace
 from recon_cli.commands.jobs import open_job_with, run_stages
 from recon_cli.commands.options import Call, explicit_settings, pass_call, verb
 from recon_cli.commands.view import show_training
+from recon_cli.config.export import ExportConfig
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import (
     DenoiseConfig,
     EvaluateConfig,
-    ExportConfig,
     ImportConfig,
     IngestConfig,
     PruneConfig,

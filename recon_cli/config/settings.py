@@ -12,12 +12,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from recon_cli.config.export import ExportConfig
 from recon_cli.config.fields import StageConfig, field_type, member_types, option_info
 from recon_cli.config.stages import (
     ComputeConfig,
     DenoiseConfig,
     EvaluateConfig,
-    ExportConfig,
     ImportConfig,
     IngestConfig,
     PruneConfig,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points

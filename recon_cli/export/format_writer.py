@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.export.camera_files import write_cameras
 from recon_cli.export.reduce import lower_degrees

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.context import EarlierResult, StageInputs
 from recon_cli.errors import ManifestError
 from recon_cli.workspace.atomic import LEFTOVERS

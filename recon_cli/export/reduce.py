@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.errors import ConfigError
 from recon_cli.export.cleanup import drop_floaters, drop_islands
 from recon_cli.io.images import fit_camera

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from recon_cli.config.export import ExportConfig
 from recon_cli.config.fields import StageConfig
 from recon_cli.config.stages import (
     DenoiseConfig,
     EvaluateConfig,
-    ExportConfig,
     ImportConfig,
     IngestConfig,
     PruneConfig,

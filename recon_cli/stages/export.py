@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconError, ReconstructionError, StageError, WorkspaceError
 from recon_cli.export.bounds import describe_bounds

@@ -10,15 +10,10 @@ from click.testing import CliRunner
 from recon_cli.cli import cli
 from recon_cli.commands import options
 from recon_cli.commands.options import Call
+from recon_cli.config.export import ExportConfig
 from recon_cli.config.fields import StageConfig, option, option_info
 from recon_cli.config.settings import SECTIONS, section_of
-from recon_cli.config.stages import (
-    ComputeConfig,
-    DenoiseConfig,
-    ExportConfig,
-    PruneConfig,
-    TrainConfig,
-)
+from recon_cli.config.stages import ComputeConfig, DenoiseConfig, PruneConfig, TrainConfig
 from recon_cli.errors import ConfigError
 
 EVERY_OPTION = [

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from recon_cli.config import settings as layers
+from recon_cli.config.export import ExportConfig
 from recon_cli.config.settings import SECTIONS
-from recon_cli.config.stages import ExportConfig, IngestConfig, PruneConfig, SfmConfig, TrainConfig
+from recon_cli.config.stages import IngestConfig, PruneConfig, SfmConfig, TrainConfig
 from recon_cli.errors import ConfigError
 
 

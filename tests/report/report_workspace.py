@@ -15,7 +15,8 @@ from tiny_scene import make_inputs
 from tiny_stages import CONTEXT, PRUNE
 
 from recon_cli.cli import main
-from recon_cli.config.stages import EvaluateConfig, ExportConfig, RunConfig, TrainConfig
+from recon_cli.config.export import ExportConfig
+from recon_cli.config.stages import EvaluateConfig, RunConfig, TrainConfig
 from recon_cli.context import StageInputs
 from recon_cli.io.images import read_image, write_png
 from recon_cli.pipeline import plan

@@ -19,13 +19,8 @@ import numpy as np
 import pytest
 import tiny_stages
 
-from recon_cli.config.stages import (
-    DenoiseConfig,
-    EvaluateConfig,
-    ExportConfig,
-    IngestConfig,
-    PruneConfig,
-)
+from recon_cli.config.export import ExportConfig
+from recon_cli.config.stages import DenoiseConfig, EvaluateConfig, IngestConfig, PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.stages import denoise, evaluate, export, ingest, prune, train
 from recon_cli.workspace import journal

@@ -9,7 +9,8 @@ import torch
 from foreign import truth
 from tiny_scene import make_inputs
 
-from recon_cli.config.stages import ExportConfig, ImportConfig
+from recon_cli.config.export import ExportConfig
+from recon_cli.config.stages import ImportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.scene.splats import Splats, joined

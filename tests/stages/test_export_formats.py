@@ -11,7 +11,7 @@ import pytest
 import torch
 from tiny_stages import CONTEXT
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError, StageError
 from recon_cli.io.colmap import read_images

@@ -14,7 +14,8 @@ import torch
 from scenes import random_splats
 from tiny_scene import make_inputs
 
-from recon_cli.config.stages import ExportConfig, RunConfig, read_matrix
+from recon_cli.config.export import ExportConfig, read_matrix
+from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.io.colmap import read_images, read_pinholes, read_points

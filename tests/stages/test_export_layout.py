@@ -17,7 +17,7 @@ import trimesh
 from PIL import Image
 from tiny_stages import CONTEXT
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.io.colmap import read_images, read_points
 from recon_cli.stages import export
 

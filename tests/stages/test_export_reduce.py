@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_stages import CONTEXT, LEARNT
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.errors import ConfigError
 from recon_cli.export.reduce import fit_to_size
 from recon_cli.export.verify import load_reference_psnr

@@ -10,7 +10,7 @@ import torch
 from scenes import random_splats
 from tiny_scene import make_inputs
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.render import render

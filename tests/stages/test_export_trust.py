@@ -7,7 +7,7 @@ import pytest
 import torch
 from tiny_stages import CONTEXT
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.errors import StageError
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.ply_tables import read_header, read_tables

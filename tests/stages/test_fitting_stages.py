@@ -12,7 +12,8 @@ import torch
 from killed import Killed, kill_after
 from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, run, without
 
-from recon_cli.config.stages import ExportConfig, PruneConfig, RunConfig
+from recon_cli.config.export import ExportConfig
+from recon_cli.config.stages import PruneConfig, RunConfig
 from recon_cli.context import TrainCallback
 from recon_cli.errors import FormatError, StageError, TrainingError
 from recon_cli.splats.ply import read_ply, write_ply

@@ -8,7 +8,8 @@ from safetensors.torch import load_file
 from scenes import random_splats, with_harmonics
 from tiny_scene import make_inputs
 
-from recon_cli.config.stages import EvaluateConfig, ExportConfig, PruneConfig, TrainConfig
+from recon_cli.config.export import ExportConfig
+from recon_cli.config.stages import EvaluateConfig, PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.export import verify
 from recon_cli.splats.ply import read_ply, write_ply

@@ -12,7 +12,8 @@ from foreign import truth
 from scenes import random_splats
 from tiny_scene import make_inputs
 
-from recon_cli.config.stages import ExportConfig, ImportConfig, PruneConfig
+from recon_cli.config.export import ExportConfig
+from recon_cli.config.stages import ImportConfig, PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
 from recon_cli.scene.similarity import Similarity

@@ -4,7 +4,7 @@ from importlib import import_module
 
 import pytest
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.splats.format import SplatFormat
 from recon_cli.splats.registry import FORMATS
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, describe_max_loss

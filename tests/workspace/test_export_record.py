@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from recon_cli.config.stages import ExportConfig
+from recon_cli.config.export import ExportConfig
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.export_record import (
     CLEAN_DB,
