@@ -78,6 +78,28 @@ class View:
     taps: list[Tap]
 
 
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """The pairs of a camera and a Gaussian that it shows, and how the caller gets their rows."""
+
+    camera_ids: Tensor  # [nnz] int64, ascending
+    gaussian_ids: Tensor  # [nnz] int64, ascending for each camera
+    shape: tuple[int, int]  # C, N
+    packed: bool
+
+    def arrange(self, rows: Tensor) -> Tensor:
+        """Returns rows [nnz, ...] as they are if packed, else as [C, N, ...] with zeros."""
+        if self.packed:
+            return rows
+        filled = rows.new_zeros(*self.shape, *rows.shape[1:])
+        return filled.index_put((self.camera_ids, self.gaussian_ids), rows)
+
+    def ids(self) -> list[Tensor]:
+        """Returns the Gaussians of each camera."""
+        counts = torch.bincount(self.camera_ids, minlength=self.shape[0])
+        return list(torch.split(self.gaussian_ids, counts.tolist()))
+
+
 class Batch:
     """The views of one call, in a graph of their own."""
 
@@ -97,22 +119,14 @@ class Batch:
                 for c, numbers in enumerate(zip(poses, intrinsics, strict=True))]
             self._images = torch.stack([view.image for view in self.views])
             self._alphas = torch.stack([view.alpha for view in self.views])[..., None]
-        self.camera_ids = torch.cat([
-            torch.full_like(view.ids, c) for c, view in enumerate(self.views)])
-        self.gaussian_ids = torch.cat([view.ids for view in self.views])
-        self._shape = None if packed else (len(poses), len(inputs.means))
+        self.layout = Layout(
+            torch.cat([torch.full_like(view.ids, c) for c, view in enumerate(self.views)]),
+            torch.cat([view.ids for view in self.views]), (len(poses), len(inputs.means)), packed)
 
     @property
     def images(self) -> tuple[Tensor, Tensor]:
         """The images [C, H, W, X] and coverages [C, H, W, 1], without a graph."""
         return self._images.detach(), self._alphas.detach()
-
-    def arrange(self, rows: Tensor) -> Tensor:
-        """Returns rows [nnz, ...] in the caller's layout: as they are, or as [C, N, ...]."""
-        if self._shape is None:
-            return rows
-        filled = rows.new_zeros(*self._shape, *rows.shape[1:])
-        return filled.index_put((self.camera_ids, self.gaussian_ids), rows)
 
     def link(self, inputs: Gaussians, means2d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the images as functions of the inputs, and of projected means, as arranged.
@@ -145,7 +159,7 @@ class Batch:
             torch.stack([tap.means2d_grad[view.ids] for tap in view.taps]).sum(0)
             for view in self.views])
         gradients = iter(found)
-        arranged = self.arrange(by_means2d)
+        arranged = self.layout.arrange(by_means2d)
         return arranged, [next(gradients) if x.requires_grad else None for x in self._leaves]
 
 

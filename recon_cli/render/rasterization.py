@@ -155,7 +155,7 @@ def rasterization(  # noqa: PLR0913  # gsplat's
         color="RGB" in render_mode, depth="D" in render_mode,
         antialiased=rasterize_mode == "antialiased", backend=_backend(backend, means, eps2d))
     batch = Batch(inputs, options, packed=packed)
-    meta, means2d = view_meta(batch, inputs, options, packed=packed)
+    meta, means2d = view_meta(batch.layout, inputs, options)
     images, alphas, meta["means2d"] = batch.link(inputs, means2d)
     if render_mode.endswith("ED"):
         depths = images[..., -1:] / alphas.clamp(min=_SMALLEST_ALPHA)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.camera_batch import (
-    Batch,
     BatchOptions,
     Gaussians,
+    Layout,
     compensations,
     ellipses,
     radii,
@@ -44,15 +44,15 @@ class _Later:
 
 
 def view_meta(
-    batch: Batch, inputs: Gaussians, options: BatchOptions, *, packed: bool
+    layout: Layout, inputs: Gaussians, options: BatchOptions
 ) -> tuple[LazyDict, Tensor]:
     """Returns all of meta but means2d, and the means2d, as arranged; see `rasterization`."""
     cameras = [
         TensorCamera(options.width, options.height, viewmat, K)
         for viewmat, K in zip(inputs.viewmats, inputs.Ks, strict=True)]
-    seen = list(zip(cameras, [view.ids for view in batch.views], strict=True))
+    seen = list(zip(cameras, layout.ids(), strict=True))
     projected = [_project(inputs.means[ids], camera) for camera, ids in seen]
-    means2d = batch.arrange(torch.cat([pixels for pixels, _ in projected]))
+    means2d = layout.arrange(torch.cat([pixels for pixels, _ in projected]))
     enabled = torch.is_grad_enabled()
 
     @cache
@@ -78,16 +78,16 @@ def view_meta(
             return exact.to(inputs.means.dtype)
 
     meta = LazyDict({
-        "batch_ids": torch.zeros_like(batch.camera_ids) if packed else None,
-        "camera_ids": batch.camera_ids if packed else None,
-        "gaussian_ids": batch.gaussian_ids if packed else None,
-        "depths": batch.arrange(torch.cat([depths for _, depths in projected])),
+        "batch_ids": torch.zeros_like(layout.camera_ids) if layout.packed else None,
+        "camera_ids": layout.camera_ids if layout.packed else None,
+        "gaussian_ids": layout.gaussian_ids if layout.packed else None,
+        "depths": layout.arrange(torch.cat([depths for _, depths in projected])),
         "width": options.width, "height": options.height, "tile_size": TILE,
         "tile_width": -(-options.width // TILE), "tile_height": -(-options.height // TILE),
         "n_cameras": len(cameras), "n_batches": 1})
-    meta.add_later("radii", lambda: batch.arrange(radii(shapes()[0], opacities()).int()))
-    meta.add_later("conics", lambda: batch.arrange(conics()))
-    meta.add_later("opacities", lambda: batch.arrange(opacities()))
+    meta.add_later("radii", lambda: layout.arrange(radii(shapes()[0], opacities()).int()))
+    meta.add_later("conics", lambda: layout.arrange(conics()))
+    meta.add_later("opacities", lambda: layout.arrange(opacities()))
     return meta, means2d
 
 

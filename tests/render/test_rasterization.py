@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import inspect
 import math
 
@@ -10,6 +12,7 @@ import pytest
 import torch
 from activated_oracle import brute_force
 from backends import CASES, GRADIENT_TOLERANCE, IMAGE_TOLERANCE, MARGIN, ORACLE_SH_TOLERANCE, Case
+from interpreter import DEVICE
 
 from recon_cli import rasterization
 from recon_cli.errors import BackendError, ConfigError, InputError
@@ -156,6 +159,18 @@ def test_the_near_plane_is_nearer_than_that_of_training() -> None:
 def test_the_torch_backend_takes_any_low_pass_filter(case: Case) -> None:
     for eps2d in (0.05, 1.5):
         check(case, compare(case, scene(), eps2d=eps2d, rasterize_mode="antialiased"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
+def test_triton_gives_every_gradient(monkeypatch) -> None:
+    """Without a GPU in its interpreter, on a CPU, where `rasterization` would refuse it."""
+    module = importlib.import_module("recon_cli.render.rasterization")
+    monkeypatch.setattr(module, "_resolve", lambda backend, _device: backend)
+    case = Case("triton", DEVICE, torch.float32)
+    check(case, compare(case, scene(10, degree=1), sh_degree=1, render_mode="RGB+D"),
+          harmonics=True)
+    check(case, compare(case, scene(10), rasterize_mode="antialiased"))
 
 
 def call(**changes):
