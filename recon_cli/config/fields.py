@@ -30,6 +30,8 @@ class OptionInfo:
     minimum: float | None = None
     maximum: float | None = None
     hashed: bool = True  # the field affects the result, and so the fingerprint of its stage
+    # hashed only where it is not its default: results from before there was the field stay fresh
+    added: bool = False
     # it decides on some files of its stage alone: their records are compared, not the fingerprint
     per_file: bool = False
     expert: bool = False  # --help leaves it to --help-all
@@ -138,7 +140,8 @@ class StageConfig:
         """Returns the fields that affect the result, for the fingerprint; a tuple as a list."""
         values = {
             item.name: getattr(self, item.name) for item in dataclasses.fields(self)
-            if option_info(item).hashed}
+            if option_info(item).hashed and not (
+                option_info(item).added and getattr(self, item.name) == item.default)}
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in values.items()}

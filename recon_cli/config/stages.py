@@ -8,6 +8,7 @@ from pathlib import Path
 
 from recon_cli.config.fields import StageConfig, option
 from recon_cli.errors import ConfigError
+from recon_cli.scene.camera import MODELS as CAMERA_MODELS
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, describe_max_loss
 
@@ -90,6 +91,10 @@ class SfmConfig(StageConfig):
         "auto", "Image pairs to match. auto: pairs that a first rough reconstruction shows to "
         "overlap; then more pairs and other mappers if the model is poor.",
         choices=("auto", "exhaustive", "retrieval", "sequential"))
+    camera: str = option(
+        "auto", "Camera model of lenses that are not known, by COLMAP's name; auto: OPENCV, or "
+        "OPENCV_FISHEYE if the matches show a fisheye.",
+        metavar="MODEL", added=True)
     max_features: int = option(
         3000, "Maximum SIFT keypoints per image; the coarsest are kept.", unit="keypoints",
         minimum=100)
@@ -128,6 +133,8 @@ class SfmConfig(StageConfig):
         super().__post_init__()
         _check_scale_between(self.scale_between)
         _check_number_of("sfm", "segments", self.segments)
+        if self.camera != "auto" and self.camera not in CAMERA_MODELS:
+            raise self._error("camera", self.camera, f"auto or {', '.join(CAMERA_MODELS)}")
         if self.segments.isdecimal() and self.pairs != "auto":
             raise ConfigError(
                 f"segments is {self.segments} and pairs is {self.pairs}, but segments choose pairs "

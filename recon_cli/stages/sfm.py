@@ -52,7 +52,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         earlier.folder, earlier.summary, earlier.changed | earlier.missing, out)
     job = MappingJob(
         frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER, out=out.resolve(),
-        groups=_groups(frames),
+        groups=_groups(frames, config.camera),
         masks=ingest / store.MASKS if any(frame.masked for frame in frames.frames) else None,
         poses=poses if poses.exists() else None, pose_use=config.poses,
         given_points=poses.exists() and read_poses(poses).points is not None,
@@ -137,11 +137,11 @@ def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
                f"{format_minutes(seconds)}{limit}.")
 
 
-def _groups(frames: FrameList) -> tuple[CameraGroup, ...]:
+def _groups(frames: FrameList, model: str) -> tuple[CameraGroup, ...]:
     return tuple(
         CameraGroup(
             tuple(frame.name for frame in frames.frames if frame.group == index),
-            group.width, group.height, group.focal_px, group.lens)
+            group.width, group.height, group.focal_px, group.lens, model)
         for index, group in enumerate(frames.groups))
 
 
