@@ -8,7 +8,6 @@ from pathlib import Path
 
 from recon_cli.config.fields import StageConfig, option
 from recon_cli.errors import ConfigError
-from recon_cli.scene.camera import MODELS as CAMERA_MODELS
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, describe_max_loss
 
@@ -133,8 +132,6 @@ class SfmConfig(StageConfig):
         super().__post_init__()
         _check_scale_between(self.scale_between)
         _check_number_of("sfm", "segments", self.segments)
-        if self.camera != "auto" and self.camera not in CAMERA_MODELS:
-            raise self._error("camera", self.camera, f"auto or {', '.join(CAMERA_MODELS)}")
         if self.segments.isdecimal() and self.pairs != "auto":
             raise ConfigError(
                 f"segments is {self.segments} and pairs is {self.pairs}, but segments choose pairs "

@@ -147,7 +147,7 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
     log = StepLog(job.attempts)
     attempts: list[MapperAttempt] = []
     verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
-    ways = _begin_with_fisheye(job, list_fallbacks(job))
+    ways = _begin_with_fisheye(job, list_fallbacks(job), report)
     reason = ways[0].reason
     for fallback in ways:
         attempt = log.result(fallback.name, MapperAttempt)
@@ -167,9 +167,22 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
     return _publish_best(job, attempts, verdicts)
 
 
-def _begin_with_fisheye(job: MappingJob, ways: tuple[Fallback, ...]) -> tuple[Fallback, ...]:
-    """Returns the ways to a model of matched pairs, that for fisheyes first if there are any."""
-    if not wide_lens.find_fisheyes(job):
+def _begin_with_fisheye(
+    job: MappingJob, ways: tuple[Fallback, ...], report: Reporter
+) -> tuple[Fallback, ...]:
+    """Returns the ways to a model of matched pairs, that for fisheyes first if there are any.
+
+    Segments are joined by their intrinsics, of which one may be found a fisheye and another not:
+    they stay with the model that their database was made with.
+    """
+    is_segment = job.last == "model"
+    if is_segment or not wide_lens.find_fisheyes(job):
+        return ways
+    if job.segments:
+        if all(group.model == "auto" for group in job.groups):
+            report.tell("The matches are those of a fisheye lens, but the segments were mapped "
+                        "with ordinary ones: `recon sfm --segments off` maps them together, and "
+                        "as fisheyes.")
         return ways
     named = any("FISHEYE" in group.model for group in job.groups)
     reason = "--camera asks for it" if named else "the matches are those of a fisheye lens"

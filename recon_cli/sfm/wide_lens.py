@@ -43,7 +43,7 @@ def find_fisheyes(job: MappingJob) -> dict[int, float]:
     """
     unknown = {number: group for number, group in enumerate(job.groups, start=1)
                if group.lens is None and (group.model == "auto" or "FISHEYE" in group.model)}
-    if not unknown or job.known_poses or job.segments:
+    if not unknown or job.known_poses:
         return {}
     samples, found = _read_samples(job), {}
     for number, group in unknown.items():

@@ -120,9 +120,21 @@ def test_a_fisheye_is_mapped_as_one_and_its_distortion_is_found(tmp_path):
 def test_an_ordinary_capture_is_mapped_as_before(tmp_path):
     job, _ = capture_of(tmp_path, WIDE)
     ways = fallbacks.list_fallbacks(job)
-    assert fallbacks._begin_with_fisheye(job, ways) is ways
+    report = Reporter(io.BytesIO())
+    assert fallbacks._begin_with_fisheye(job, ways, report) is ways
     named = dataclasses.replace(job, groups=(
         dataclasses.replace(job.groups[0], model="OPENCV_FISHEYE"),))
-    first, second, *_ = fallbacks._begin_with_fisheye(named, ways)
+    first, second, *_ = fallbacks._begin_with_fisheye(named, ways, report)
     assert (first.name, first.reason) == ("fisheye", "--camera asks for it")
     assert second.name == ways[0].name
+
+
+def test_segments_stay_with_one_model_of_lenses_and_say_so(tmp_path):
+    job, _ = capture_of(tmp_path, FISHEYE)
+    ways, stream = fallbacks.list_fallbacks(job), io.BytesIO()
+    segment = dataclasses.replace(job, last="model")
+    assert fallbacks._begin_with_fisheye(segment, ways, Reporter(stream)) is ways
+    assert not stream.getvalue()
+    joined = dataclasses.replace(job, segments=(job.names[:5], job.names[3:]))
+    assert fallbacks._begin_with_fisheye(joined, ways, Reporter(stream)) is ways
+    assert b"--segments off" in stream.getvalue()
