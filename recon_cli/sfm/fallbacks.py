@@ -28,6 +28,7 @@ from recon_cli.sfm import (
     merge_models,
     parts,
     skeleton,
+    wide_lens,
 )
 from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
 from recon_cli.sfm.limits import ENOUGH_FRAMES, MIN_FRAMES, MIN_ONE_POINT, MIN_PAIR_INLIERS
@@ -146,7 +147,7 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
     log = StepLog(job.attempts)
     attempts: list[MapperAttempt] = []
     verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
-    ways = list_fallbacks(job)
+    ways = _begin_with_fisheye(job, list_fallbacks(job), report)
     reason = ways[0].reason
     for fallback in ways:
         attempt = log.result(fallback.name, MapperAttempt)
@@ -164,6 +165,29 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
                 report.tell(f"trying another mapper, for about "
                             f"{format_minutes(FURTHER * attempt.seconds)} more: {reason}")
     return _publish_best(job, attempts, verdicts)
+
+
+def _begin_with_fisheye(
+    job: MappingJob, ways: tuple[Fallback, ...], report: Reporter
+) -> tuple[Fallback, ...]:
+    """Returns the ways to a model of matched pairs, that for fisheyes first if there are any.
+
+    Segments are joined by their intrinsics, of which one may be found a fisheye and another not:
+    they stay with the model that their database was made with.
+    """
+    is_segment = job.last == "model"
+    if is_segment or not wide_lens.find_fisheyes(job):
+        return ways
+    if job.segments:
+        if all(group.model == "auto" for group in job.groups):
+            report.tell("The matches are those of a fisheye lens, but the segments were mapped "
+                        "with ordinary ones: `recon sfm --segments off` maps them together, and "
+                        "as fisheyes.")
+        return ways
+    named = any("FISHEYE" in group.model for group in job.groups)
+    reason = "--camera asks for it" if named else "the matches are those of a fisheye lens"
+    fisheye = Fallback(wide_lens.ATTEMPT, reason, lambda *_: set(), wide_lens.map_fisheye)
+    return (fisheye, dataclasses.replace(ways[0], choose_pairs=lambda *_: set()), *ways[1:])
 
 
 def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
@@ -290,7 +314,7 @@ def _publish_best(
 def _with_own_matches(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
     own = job.attempts / name / skeleton.MATCHES_DB
-    has_own = name == TRACKS or (name == SEGMENTS and job.tracks is not None)
+    has_own = name in (TRACKS, wide_lens.ATTEMPT) or (name == SEGMENTS and job.tracks is not None)
     return dataclasses.replace(job, matches_db=own) if has_own else job
 
 

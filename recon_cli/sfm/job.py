@@ -50,6 +50,7 @@ class CameraGroup(JsonRecord):
     height: int
     focal_px: float | None = None  # a guess
     lens: Lens | None = None  # known intrinsics
+    model: str = "auto"  # of COLMAP, to be estimated where they are not known
 
 
 @dataclass(frozen=True)

@@ -82,15 +82,16 @@ def _check_readable(job: MappingJob, readable: Collection[str]) -> None:
 
 def _reader_options(group: CameraGroup, masks: Path | None = None) -> pycolmap.ImageReaderOptions:
     options = pycolmap.ImageReaderOptions()
-    options.camera_model = CAMERA_MODEL
+    options.camera_model = CAMERA_MODEL if group.model == "auto" else group.model
     if masks is not None:
         options.mask_path = masks
     if group.lens is not None:
         options.camera_model = group.lens.model
         options.camera_params = ",".join(map(repr, group.lens.params))
     elif group.focal_px is not None:
-        focal = group.focal_px
-        options.camera_params = f"{focal},{focal},{group.width / 2},{group.height / 2},0,0,0,0"
+        camera = pycolmap.Camera.create_from_model_name(
+            1, options.camera_model, group.focal_px, group.width, group.height)
+        options.camera_params = ",".join(map(repr, map(float, camera.params)))
     return options
 
 

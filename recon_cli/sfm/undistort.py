@@ -9,7 +9,7 @@ from __future__ import annotations
 import filecmp
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -32,6 +32,7 @@ from recon_cli.sfm.undistort_faces import write_views
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import WorldSummary
 
+MOST_LOST = 0.1  # of a frame by undistortion, above which it is told
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 
 
@@ -86,6 +87,7 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
     flat = _write_model(job, model, names[0], work)
     warps = {number: _warp(camera, flat.cameras[number])
              for number, camera in model.cameras.items()}
+    _tell_lost(model, warps, report)
     masked = {name for name in names if job.masks and (job.masks / name).exists()}
     for folder in (IMAGES, TWINS, *([MASKS] if masked else [])):
         (work / folder).mkdir()
@@ -145,6 +147,28 @@ def _warp(camera: pycolmap.Camera, flat: pycolmap.Camera) -> NDArray[np.float32]
     rays = np.asarray(flat.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1)))
     places = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
     return (places - 0.5).reshape(flat.height, flat.width, 2).astype(np.float32)
+
+
+def _tell_lost(
+    model: pycolmap.Reconstruction, warps: Mapping[int, NDArray[np.float32]], report: Reporter
+) -> None:
+    """Gives notice of lenses of which one pinhole picture shows much less than the frame."""
+    for number, warp in sorted(warps.items()):
+        camera = model.camera(number)
+        lost = 1 - covered_share(warp, camera.width, camera.height)
+        if lost > MOST_LOST:
+            which = "" if len(warps) == 1 else f" of camera {number}"
+            report.tell(
+                f"The lens{which} is so wide that undistorted pictures leave out {lost:.0%} of "
+                "each frame, at its edges: what only the edges show is not trained. Cameras are "
+                "found with the whole frames.")
+
+
+def covered_share(warp: NDArray[np.float32], width: int, height: int) -> float:
+    """Returns the share of a frame that an undistorted image shows, by its `_warp` [H, W, 2]."""
+    border = np.concatenate([warp[0], warp[:, -1], warp[-1, ::-1], warp[::-1, 0]])
+    # through the middles of the outer pixels, half a pixel inside
+    return float(cv2.contourArea(border)) / ((width - 1) * (height - 1))
 
 
 def _remap(image: NDArray[np.uint8], warp: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -13,7 +13,13 @@ from recon_cli.commands.options import Call
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.fields import StageConfig, option, option_info
 from recon_cli.config.settings import SECTIONS, section_of
-from recon_cli.config.stages import ComputeConfig, DenoiseConfig, PruneConfig, TrainConfig
+from recon_cli.config.stages import (
+    ComputeConfig,
+    DenoiseConfig,
+    PruneConfig,
+    SfmConfig,
+    TrainConfig,
+)
 from recon_cli.errors import ConfigError
 
 EVERY_OPTION = [
@@ -166,3 +172,8 @@ def test_some_fields_can_be_left_out() -> None:
     assert "--at" not in names
     assert "--ratio" in names
     assert all(one.help.startswith("With --prune: ") for one in command.params)
+
+
+def test_the_camera_model_leaves_results_from_before_fresh() -> None:
+    assert "camera" not in SfmConfig().hashed_fields()
+    assert SfmConfig(camera="RADIAL").hashed_fields()["camera"] == "RADIAL"

@@ -94,3 +94,23 @@ def test_progress_ends_with_the_last_frame(mapped):
     phase, *counts = map(parse, stream.getvalue().splitlines())
     assert phase == Phase("undistorted", 6, 0)
     assert counts == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(("params", "lost"), [
+    ((0.0, 0.0, 0.0, 0.0), None), ((-0.05, 0.0, 0.0, 0.0), None), ((3.0, 0.0, 0.0, 0.0), 15)])
+def test_a_lens_of_which_a_pinhole_shows_little_is_told(mapped, params, lost):
+    job, model = mapped
+    stream = io.BytesIO()
+    run(job, model, params, report=Reporter(stream))
+    told = [text for text in map(parse, stream.getvalue().splitlines()) if isinstance(text, str)]
+    if lost is None:
+        assert not told
+    else:
+        (text,) = told
+        assert int(text.split("leave out ")[1].split("%")[0]) > 10
+
+
+def test_the_share_that_a_picture_covers_is_that_of_its_border():
+    across, down = np.meshgrid(np.linspace(10, 89, 50), np.linspace(0, 59, 40))
+    warp = np.stack([across, down], axis=2).astype(np.float32)
+    assert undistort.covered_share(warp, 100, 60) == pytest.approx(79 / 99)

@@ -11,7 +11,7 @@ from sfm_inputs import run, texture, turning, write_inputs
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import FormatError, SfmError
+from recon_cli.errors import ConfigError, FormatError, SfmError
 from recon_cli.sfm import database, time_estimate
 from recon_cli.sfm.job import CameraGroup
 from recon_cli.sfm.results import MappingResult, ModelResult, PartResult
@@ -203,3 +203,10 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted():
     assert summary.left_out == ("3.png", "4.png")
     assert summary.unregistered == ("3.png", "4.png", "5.png")  # no mapper found a place for 5
     assert summary.unregistered_held_out == ("4.png",)
+
+
+def test_a_camera_model_that_colmap_does_not_have_is_refused_by_name(tmp_path):
+    inputs = write_inputs(tmp_path, turning(3))
+    with pytest.raises(ConfigError, match="camera is 'GOPRO'") as caught:
+        run(inputs, tmp_path / "out", camera="GOPRO")
+    assert "OPENCV_FISHEYE" in caught.value.hint

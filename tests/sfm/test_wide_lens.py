@@ -1,0 +1,140 @@
+"""Fisheyes are told from ordinary lenses by matches, and mapped as fisheyes.
+
+In a room of points around the cameras, projected by COLMAP's own models.
+"""
+
+import dataclasses
+import io
+import itertools
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic import make_capture
+
+from recon_cli.sfm import fallbacks, matching, wide_lens
+from recon_cli.sfm.job import CameraGroup, Reporter
+
+WIDTH, HEIGHT = 1024, 768
+FISHEYE = ("OPENCV_FISHEYE", (360.0, 363.0, 518.0, 380.0, 0.03, -0.006, 0.001, -0.0001))
+WIDE = ("OPENCV", (620.0, 620.0, 510.0, 386.0, -0.12, 0.02, 0.0, 0.0))  # 79 degrees and a barrel
+GROUP = CameraGroup((), WIDTH, HEIGHT)
+
+
+def camera_of(lens):
+    model, params = lens
+    return pycolmap.Camera(camera_id=1, model=model, width=WIDTH, height=HEIGHT, params=params)
+
+
+def walk(count):
+    """Poses [4, 4], world to camera, of a walk that looks about."""
+    poses = []
+    for step in np.linspace(0, 1, count):
+        turn = pycolmap.Rotation3d(np.array([0.1 * step, 1.1 * step - 0.5, 0.0])).matrix()
+        center = np.array([step - 0.5, 0.1 * np.sin(6 * step), 0.8 * step * (1 - step)])
+        poses.append(np.vstack([np.column_stack([turn, -turn @ center]), [0, 0, 0, 1]]))
+    return poses
+
+
+def shots(lens, count, seed=0):
+    """The poses of a walk through points on the walls of a room, and their pixels by number."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (900, 3))
+    axis = rng.integers(0, 3, len(points))
+    points[np.arange(len(points)), axis] = np.sign(points[np.arange(len(points)), axis])
+    points *= [3.0, 1.5, 3.0]
+    camera, pictures = camera_of(lens), []
+    for pose in walk(count):
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        rows = np.flatnonzero(local[:, 2] > 0.15 * np.linalg.norm(local, axis=1))
+        pixels = np.array(camera.img_from_cam(local[rows])) + rng.normal(0, 0.3, (len(rows), 2))
+        inside = ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(axis=1)
+        pictures.append(dict(zip(rows[inside].tolist(), pixels[inside], strict=True)))
+    return walk(count), pictures
+
+
+def samples(lens):
+    _, pictures = shots(lens, 6)
+    found = []
+    for one, other in itertools.combinations(pictures, 2):
+        both = sorted(one.keys() & other.keys())
+        found.append((np.array([one[row] for row in both]), np.array([other[row] for row in both])))
+    return found
+
+
+def test_a_fisheye_is_found_with_about_its_focal_length():
+    focal = wide_lens._find_focal(GROUP, samples(FISHEYE), seed=0)
+    assert focal == pytest.approx(360, rel=0.12)  # steps are a fifth
+
+
+@pytest.mark.parametrize("lens", [
+    WIDE, ("SIMPLE_PINHOLE", (900.0, 512.0, 384.0)), ("SIMPLE_PINHOLE", (480.0, 512.0, 384.0))])
+def test_an_ordinary_lens_is_none(lens):
+    assert wide_lens._find_focal(GROUP, samples(lens), seed=0) is None
+
+
+def test_few_matches_decide_nothing_unless_the_lens_is_named():
+    few = [(ours[:10], theirs[:10]) for ours, theirs in samples(FISHEYE)]
+    assert wide_lens._find_focal(GROUP, few, seed=0) is None
+    named = dataclasses.replace(GROUP, model="RADIAL_FISHEYE")
+    assert wide_lens._find_focal(named, few, seed=0) is not None
+    assert wide_lens._camera(named, wide_lens.FISHEYE, 300.0).model_name == "RADIAL_FISHEYE"
+
+
+def capture_of(folder, lens, count=8):
+    """A job whose database has the matches of a walk, and the true centres [N, 3]."""
+    job, _ = make_capture(folder, frames=count)
+    poses, pictures = shots(lens, count)
+    with pycolmap.Database.open(job.database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        opened.clear_keypoints()
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+        order = [ids[name] for name in job.names]
+        rows = [sorted(picture) for picture in pictures]
+        for number, picture, own in zip(order, pictures, rows, strict=True):
+            opened.write_keypoints(
+                number, np.array([picture[row] for row in own], np.float32))
+        for one, other in itertools.combinations(range(count), 2):
+            both = sorted(set(rows[one]) & set(rows[other]))
+            opened.write_matches(order[one], order[other], np.array(
+                [[rows[one].index(row), rows[other].index(row)] for row in both], np.uint32))
+    matching.verify_pairs(job, itertools.combinations(job.names, 2))
+    return job, np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
+
+
+def test_a_fisheye_is_mapped_as_one_and_its_distortion_is_found(tmp_path):
+    job, centers = capture_of(tmp_path, FISHEYE)
+    result = fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=float("inf"))
+    (attempt,) = result.attempts
+    assert (attempt.name, attempt.reason) == (
+        "fisheye", "the matches are those of a fisheye lens")
+    model = pycolmap.Reconstruction(job.model)
+    assert model.camera(1).model_name == "OPENCV_FISHEYE"
+    np.testing.assert_allclose(model.camera(1).params[:4], FISHEYE[1][:4], atol=3)
+    found = np.array([model.find_image_with_name(name).projection_center() for name in job.names])
+    motion = pycolmap.estimate_sim3d(found, centers).matrix()
+    assert np.abs(found @ motion[:, :3].T + motion[:, 3] - centers).max() < 0.005
+
+
+def test_an_ordinary_capture_is_mapped_as_before(tmp_path):
+    job, _ = capture_of(tmp_path, WIDE)
+    ways = fallbacks.list_fallbacks(job)
+    report = Reporter(io.BytesIO())
+    assert fallbacks._begin_with_fisheye(job, ways, report) is ways
+    named = dataclasses.replace(job, groups=(
+        dataclasses.replace(job.groups[0], model="OPENCV_FISHEYE"),))
+    first, second, *_ = fallbacks._begin_with_fisheye(named, ways, report)
+    assert (first.name, first.reason) == ("fisheye", "--camera asks for it")
+    assert second.name == ways[0].name
+
+
+def test_segments_stay_with_one_model_of_lenses_and_say_so(tmp_path):
+    job, _ = capture_of(tmp_path, FISHEYE)
+    ways, stream = fallbacks.list_fallbacks(job), io.BytesIO()
+    segment = dataclasses.replace(job, last="model")
+    assert fallbacks._begin_with_fisheye(segment, ways, Reporter(stream)) is ways
+    assert not stream.getvalue()
+    joined = dataclasses.replace(job, segments=(job.names[:5], job.names[3:]))
+    assert fallbacks._begin_with_fisheye(joined, ways, Reporter(stream)) is ways
+    assert b"--segments off" in stream.getvalue()
