@@ -38,7 +38,7 @@ PROTOCOLS = {protocol.name: protocol for protocol in (
     Protocol(
         "3dgs", "3DGS as published: INRIA's densification, rates, loss and schedule, degree 3",
         {**_SPLIT, "densify": "reference", "sh_degree": 3, "images": "original", "far": "off",
-         "stereo": "off", "exposure": "off"},
+         "stereo": "off", "exposure": "off", "max_radius": 0.0},
         whole_schedule=True, limits_count=False),
     Protocol("recon", "the recipe of recon, on the same views", _SPLIT))}
 SPLIT_WORDS = "every 8th view by name held out, no validation views"

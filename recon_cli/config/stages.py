@@ -241,6 +241,10 @@ class TrainConfig(StageConfig):
     densify_gradient: float = option(
         2e-4, "With reference: clone or split where the mean gradient of the projected mean is "
         "larger.", unit="NDC", minimum=0.0, expert=True)
+    # INRIA's code clears the radii before it looks at them: no published run has deleted one so
+    max_radius: float = option(
+        20.0, "With reference: delete Gaussians wider than this, as 3DGS is described; 0: never, "
+        "as its code does.", unit="pixels", minimum=0.0, expert=True, late=True)
     min_opacity: float = option(
         0.005, "Delete Gaussians below this opacity.", minimum=0.0, maximum=1.0, expert=True)
     mid: float = option(

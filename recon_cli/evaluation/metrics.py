@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
 from recon_cli.scene.train_view import BORDER, MIN_SIDE, without_border
+from recon_cli.workspace.digests import digest_file
 
 PSNR_CONVENTION = "mean of per-image dB, float render clamped to [0, 1] against 8-bit truth"
 PSNR_8BIT_CONVENTION = "the same of the render rounded to 8 bits, as a picture file holds it"
@@ -35,7 +36,8 @@ CONVENTION_LINES = (  # below tables
     f"PSNR: {PSNR_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\nSSIM: {SSIM_CONVENTION}\n"
     f"SSIM 0-pad: {SSIM_PADDED_CONVENTION}\n")
 _MAX_DB = 100.0  # of equal images, which JSON cannot hold
-_LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them
+_LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them: ends in their SHA-256
+_LPIPS_ADDRESS = f"https://download.pytorch.org/models/{_LPIPS_WEIGHTS}"
 
 Perceptual = Callable[[NDArray[np.float32], NDArray[Any]], float]
 
@@ -127,9 +129,14 @@ def load_lpips() -> tuple[Perceptual | None, str]:
                       f"that belongs to torch {torch.__version__}")
     weights = Path(torch.hub.get_dir()) / "checkpoints" / _LPIPS_WEIGHTS
     if not weights.is_file():
-        return None, (f"its weights are not at {weights}; `python -c \"import lpips; "
-                      "lpips.LPIPS(net='alex')\"` fetches them once")
-    network = lpips.LPIPS(net="alex", verbose=False).eval()
+        return None, f"its weights are not at {weights}; save {_LPIPS_ADDRESS} (244 MB) there"
+    if not digest_file(weights).sha256.startswith(weights.stem[-8:]):
+        return None, f"{weights} is damaged; save {_LPIPS_ADDRESS} there again"
+    # without its backbone, which the package would unpickle with whatever code it holds
+    network = lpips.LPIPS(net="alex", pnet_rand=True, verbose=False).eval()
+    backbone = torch.load(weights, map_location="cpu", weights_only=True)
+    for name, parameter in network.net.named_parameters():  # slice1.0.weight is features.0.weight
+        parameter.data = backbone["features." + name.split(".", 1)[1]]
 
     def distance(image: NDArray[np.float32], truth: NDArray[Any]) -> float:
         with torch.no_grad():  # of [1, 3, H, W] in [-1, 1]

@@ -28,7 +28,6 @@ RESET_OPACITY = 0.01
 _SPLIT = 2  # Gaussians that replace one that is split
 _SHRINK = 1.6  # their scales are divided by this
 _CLONE_SCALE = 0.01  # x extent; up to it one is cloned, above it split (INRIA's percent_dense)
-_MAX_RADIUS = 20.0  # pixels on the screen
 _LARGE_SCALE = 0.1  # x extent; larger Gaussians are deleted once opacities were reset
 # of `budget`
 _GROWTH = 0.5  # of the count, at most, at once: children need some steps to find their place
@@ -49,6 +48,7 @@ class DensifyRule:
     # scale in world units from which it is deleted; None keeps large ones
     large_scale: float | None
     most: int  # count that is never exceeded; the largest gradients come first
+    max_radius: float = 20.0  # pixels on the screen; wider ones go where large ones do
 
 
 def densify_reference(
@@ -95,7 +95,7 @@ def _fits(splats: Splats, gathered: DensificationStats, rule: DensifyRule) -> Te
     if rule.large_scale is None:
         return torch.ones_like(gathered.radius, dtype=torch.bool)
     largest = splats.scales.detach().amax(1)
-    fits: Tensor = (gathered.radius <= _MAX_RADIUS) & (largest <= rule.large_scale)
+    fits: Tensor = (gathered.radius <= rule.max_radius) & (largest <= rule.large_scale)
     return fits
 
 
@@ -204,7 +204,7 @@ def _reference(state: TrainState, task: Task) -> None:
         large = _LARGE_SCALE * task.extent if schedule.deletes_large(state.iteration) else None
         rule = DensifyRule(
             config.densify_gradient, _CLONE_SCALE * task.extent, config.min_opacity, large,
-            config.max_gaussians)
+            config.max_gaussians, config.max_radius or math.inf)
         gathered = replace(
             state.gathered, pull=state.gathered.pull * task.inside(state.splats.means))
         replace_splats(state, *densify_reference(state.splats, gathered, rule, state.generator))

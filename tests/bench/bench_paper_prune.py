@@ -67,7 +67,9 @@ GRID = (
     *(Setting(ratio, at) for at in (THIRD, 0.5, 5 / 6) for ratio in (0.1, 0.3)),
     *(Setting(ratio, rounds=3) for ratio in (0.1, 0.3, 0.6)),
     *(Setting(ratio, restarts=True) for ratio in (0.1, 0.3, 0.6)),
-    Setting(0.3, score="random"), Setting(0.3, score="loo"))
+    # controls: as many removed otherwise, and the restart of the rates alone
+    Setting(0.3, score="random"), Setting(0.3, score="loo"), Setting(0.0, restarts=True),
+    *(Setting(ratio, THIRD, score="random") for ratio in (0.1, 0.3)))
 NONE = "3DGS"
 
 
@@ -106,28 +108,32 @@ def make_runs(loaded: LoadedScene, seed: int, steps: int, skip: set[str], scratc
 
 
 def difference_table(rows: list[dict[str, object]]) -> Table:
-    """Returns each setting minus 3DGS: the mean over scenes with its interval over seeds."""
+    """Returns each setting minus 3DGS of the same scene and seed.
+
+    The means are over seeds, then over scenes; the intervals are Student's over the scenes, so they
+    are about other captures.
+    """
     value = {(row["scene"], row["seed"], row["setting"]): row for row in rows}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
 
-    def means(setting: str, figure: str, among: list[object]) -> list[float]:
-        seeds = sorted({seed for scene, seed, name in value if name == setting})
-        return [sum(float(value[scene, seed, setting][figure]) for scene in among) / len(among)
-                for seed in seeds if all((scene, seed, setting) in value for scene in among)]
+    def by_scene(setting: str, figure: str) -> list[float]:
+        found = [[float(row[figure]) - float(value[scene, seed, NONE][figure])
+                  for (of, seed, name), row in value.items()
+                  if (of, name) == (scene, setting) and (scene, seed, NONE) in value]
+                 for scene in scenes]
+        return [sum(values) / len(values) for values in found if values]
 
     lines = []
     for setting in GRID:
-        ours, theirs = means(setting.name, "psnr_db", scenes), means(NONE, "psnr_db", scenes)
-        if not ours:
+        psnr, ssim = (by_scene(setting.name, figure) for figure in ("psnr_db", "ssim"))
+        if not psnr:
             continue
-        theirs = theirs[:len(ours)]
-        psnr = paired_t(ours, theirs)
-        ssim = paired_t(
-            means(setting.name, "ssim", scenes), means(NONE, "ssim", scenes)[:len(ours)])
-        each = [paired_t(means(setting.name, "psnr_db", [scene]),
-                         means(NONE, "psnr_db", [scene])) for scene in scenes]
-        lines.append((setting.name, psnr.text("+.2f"), psnr.verdict, ssim.text("+.4f"),
-                      *(interval.text("+.2f") for interval in each)))
+        nothing = [0.0] * len(psnr)
+        interval = paired_t(psnr, nothing)
+        lines.append((
+            setting.name, interval.text("+.2f"), interval.verdict,
+            paired_t(ssim, nothing).text("+.4f"), *(f"{value:+.2f}" for value in psnr),
+            *["-"] * (len(scenes) - len(psnr))))
     return Table(("prune", "PSNR dB", "so it is", "SSIM", *map(str, scenes)), lines)
 
 

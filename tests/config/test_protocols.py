@@ -23,6 +23,7 @@ def test_3dgs_is_the_published_recipe_on_all_views_that_are_not_held_out() -> No
     run = RunConfig(**{item.name: getattr(config, item.name) for item in dataclasses.fields(config)
                        if getattr(config, item.name) is not None})
     assert run.is_reference
+    assert config.max_radius == 0
     assert not config.early_stop
     assert config.blocks == "off"
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
+from recon_cli.evaluation import metrics
 from recon_cli.evaluation.metrics import load_lpips, psnr, ssim
 from recon_cli.io.images import to_uint8
 from recon_cli.scene.train_view import leaves_enough
@@ -152,20 +153,54 @@ def test_lpips_beside_the_torchvision_of_another_torch_is_left_out_with_its_reas
     assert torch.__version__ in reason
 
 
-def test_lpips_gets_both_pictures_between_minus_one_and_one(monkeypatch, tmp_path):
+@pytest.fixture
+def backbone(monkeypatch, tmp_path):
+    """A cache of torchvision with weights of the right digest, and a package lpips on them."""
     (tmp_path / "checkpoints").mkdir()
-    (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"x")
+    path = tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth"
+    torch.save({"features.0.weight": torch.full((1,), 4.0)}, path)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(
+        metrics, "digest_file", lambda _: SimpleNamespace(sha256="7be5be79" + 56 * "0"))
 
-    class Network:
-        def __init__(self, net, verbose):
-            assert (net, verbose) == ("alex", False)
+    class Network(torch.nn.Module):
+        def __init__(self, net, pnet_rand, verbose):
+            super().__init__()
+            assert (net, pnet_rand, verbose) == ("alex", True, False)  # it loads no backbone
+            self.net = torch.nn.Module()
+            self.net.slice1 = torch.nn.Sequential()
+            self.net.slice1.add_module("0", torch.nn.Linear(1, 1, bias=False))
 
-        def eval(self):
-            return lambda a, b: (a.min(), b.max(), torch.tensor(a.shape))[0] + b.max() / 4
+        def forward(self, a, b):
+            return a.min() + b.max() / self.net.slice1[0].weight[0]
 
     monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=Network))
+    return path
+
+
+@pytest.mark.usefixtures("backbone")
+def test_lpips_gets_both_pictures_between_minus_one_and_one_and_its_backbone_from_the_cache():
     distance, reason = load_lpips()
     assert reason == ""
     image, truth = np.zeros((16, 20, 3), np.float32), np.full((16, 20, 3), 255, np.uint8)
     assert distance(image, truth) == pytest.approx(-1 + 1 / 4)
+
+
+def test_a_backbone_that_would_run_code_is_not_loaded(backbone):
+    class Harm:
+        def __reduce__(self):
+            return (print, ("harm",))
+
+    torch.save({"features.0.weight": Harm()}, backbone)
+    with pytest.raises(Exception, match=r"[Ww]eights"):
+        load_lpips()
+
+
+def test_a_backbone_that_is_damaged_is_named(backbone, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(backbone.parents[1]))
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())
+    distance, reason = load_lpips()
+    assert distance is None
+    assert f"{backbone} is damaged" in reason
+    assert "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth" in reason

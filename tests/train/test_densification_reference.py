@@ -1,14 +1,23 @@
 """Cloning, splitting and deleting, each on Gaussians chosen to show it."""
 
+import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 from scenes import joined, one_splat
 
+from recon_cli.config.stages import RunConfig
 from recon_cli.render import Statistics
-from recon_cli.train.densification import DensifyRule, cap_opacities, densify_reference
-from recon_cli.train.state import DensificationStats
+from recon_cli.train.densification import (
+    STRATEGIES,
+    DensifyRule,
+    cap_opacities,
+    densify_reference,
+)
+from recon_cli.train.schedule import Schedule
+from recon_cli.train.state import DensificationStats, new_state
 
 RULE = DensifyRule(gradient=1.0, clone_scale=0.1, min_opacity=0.005, large_scale=1.0, most=100)
 
@@ -58,6 +67,21 @@ def test_one_that_covers_too_much_of_the_screen_is_deleted_only_when_asked():
     kept = DensifyRule(1.0, 0.1, 0.005, None, 100)
     assert len(densify_reference(splat(), gathered, RULE, torch.Generator())[0]) == 0
     assert len(densify_reference(splat(), gathered, kept, torch.Generator())[0]) == 1
+    published = dataclasses.replace(RULE, max_radius=math.inf)  # INRIA's code never deletes it
+    assert len(densify_reference(splat(), gathered, published, torch.Generator())[0]) == 1
+
+
+@pytest.mark.parametrize(("option", "left"), [(20.0, 1), (0.0, 2)])
+def test_the_option_says_how_wide_one_may_be_on_the_screen(option, left):
+    config = RunConfig(densify="reference", iterations=30_000, max_radius=option)
+    task = SimpleNamespace(
+        schedule=Schedule(config), extent=100.0, device=torch.device("cpu"),
+        inside=lambda means: torch.ones(len(means)))
+    state = new_state(joined(splat(), splat()), config, 1.0)
+    state.iteration = 3100  # opacities were reset once
+    state.gathered.radius[0] = 21.0
+    STRATEGIES["reference"].control(state, task)
+    assert len(state.splats) == left
 
 
 def test_the_count_never_exceeds_its_cap_and_the_hardest_pulled_come_first():
