@@ -217,6 +217,15 @@ def shortfall(candidate: ModelCandidate, reach: Collection[str]) -> str:
     return ""
 
 
+def describe_other_rooms(job: MappingJob, candidate: ModelCandidate) -> str:
+    """Returns why a model of panoramas is not all that could be mapped; empty if it is."""
+    placed = {*mapper.list_registered(candidate.model), *sum(candidate.apart, ())}
+    others = [names for names in candidate.verdict.match_parts
+              if len(names) >= MIN_FRAMES and placed.isdisjoint(names)]
+    return "" if not job.panoramas or not others else (
+        f"{sum(map(len, others))} panoramas match each other, but not those that have a camera")
+
+
 def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     """Returns the attempt with the best model: many frames that are strongly connected.
 
@@ -265,7 +274,8 @@ def _try_fallback(
         write_model(model, fresh_folder(folder / name))
     attempt = MapperAttempt(
         fallback.name, reason, seconds, "", tuple(mapper.list_registered(candidate.model)),
-        shortfall(candidate, reachable(job, candidate)), candidate.apart, candidate.rejected,
+        shortfall(candidate, reachable(job, candidate)) or describe_other_rooms(job, candidate),
+        candidate.apart, candidate.rejected,
         candidate.verdict.trusted, candidate.verdict.weakest_cut.share,
         candidate.model.compute_mean_reprojection_error())
     return attempt, candidate

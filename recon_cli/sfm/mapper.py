@@ -254,6 +254,9 @@ def _options(job: MappingJob) -> pycolmap.IncrementalPipelineOptions:
     options.min_model_size = MIN_FRAMES  # COLMAP's 10 would drop small captures
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_RATIO
     options.ba_global_function_tolerance = TOLERANCE
+    if job.panoramas:  # they see parallax to their sides, however they move
+        options.mapper.init_max_forward_motion = 1.0
+        options.triangulation.ignore_two_view_tracks = False
     return options
 
 
@@ -282,6 +285,9 @@ def _global_options(job: MappingJob) -> pycolmap.GlobalPipelineOptions:
     options.random_seed = mapper.random_seed = job.seed
     mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = job.seed
     mapper.retriangulation.random_seed = job.seed
+    if job.panoramas:
+        mapper.track_min_num_views_per_track = 2
+        mapper.retriangulation.ignore_two_view_tracks = False
     return options
 
 

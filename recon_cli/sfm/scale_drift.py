@@ -16,11 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, eye, hstack
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.floor_heights import SPREAD, compare_heights, measure_heights
-from recon_cli.sfm.limits import LOSS_SCALE
+from recon_cli.sfm.limits import LOSS_SCALE, MIN_PAIR_INLIERS
 from recon_cli.sfm.sphere import is_panorama, radian_px, ray_frames, unit_rays
 from recon_cli.workspace.json_record import JsonRecord
 
@@ -73,6 +74,31 @@ def find_weakest_scale(
     first_side, second_side = sorted(parts, key=len)
     return ScaleCut(errors[place], order[place - 1], order[place],
                     (first_side, second_side))
+
+
+def find_hinge(
+    model: pycolmap.Reconstruction, names: Sequence[str],
+    shared: NDArray[np.int64],  # [F, F], points that two of the images both see
+) -> ScaleCut | None:
+    """Returns the image that alone joins two groups, where their relative scale is known least.
+
+    Panoramas that stand in neighbouring rooms may meet in one of them. Then each group has a scale
+    of its own, unless points of both are the same. None where no image is a hinge.
+    """
+    information, worst = _Information(model, names), None
+    for hinge in range(len(names)):
+        rest = np.delete(np.arange(len(names)), hinge)
+        links = csr_matrix(shared[np.ix_(rest, rest)] >= MIN_PAIR_INLIERS)
+        count, groups = connected_components(links, directed=False)
+        for group in range(count if count > 1 else 0):
+            side, others = rest[groups == group], rest[groups != group]
+            error = information.error(np.append(side, hinge), np.append(others, hinge))
+            if worst is None or error > worst.error:
+                parts = [tuple(names[row] for row in rows)
+                         for rows in (side, np.append(others, hinge))]
+                first, second = sorted(parts, key=len)
+                worst = ScaleCut(error, names[int(side[0])], names[hinge], (first, second))
+    return worst
 
 
 def is_scale_known(cut: ScaleCut | None) -> bool:

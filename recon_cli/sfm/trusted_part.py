@@ -65,7 +65,9 @@ def cuts_models(job: MappingJob) -> bool:
 
 
 def least_frames(job: MappingJob) -> int:
-    """Returns how many frames a part beside the largest must have."""
+    """Returns how many frames a part beside the largest must have; three panoramas show rooms."""
+    if job.panoramas:
+        return MIN_FRAMES
     return min(max(len(job.names) // 10, FEWEST_FRAMES), WORTH_FRAMES)
 
 

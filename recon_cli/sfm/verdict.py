@@ -24,7 +24,13 @@ from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
 from recon_cli.sfm.limits import FEW_KEYPOINTS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
 from recon_cli.sfm.open_loops import OpenLoop, find_open_loops
-from recon_cli.sfm.scale_drift import MAX_SCALE_ERROR, ScaleCut, find_weakest_scale, is_scale_known
+from recon_cli.sfm.scale_drift import (
+    MAX_SCALE_ERROR,
+    ScaleCut,
+    find_hinge,
+    find_weakest_scale,
+    is_scale_known,
+)
 from recon_cli.sfm.sphere import is_panorama
 from recon_cli.sfm.still_points import MAX_STILL, find_still_share
 from recon_cli.sfm.visual_aliasing import VisualAliasing
@@ -184,13 +190,22 @@ def examine(
 def _find_drift(
     model: pycolmap.Reconstruction, evidence: MatchEvidence, order: NDArray[np.int64] | None
 ) -> tuple[tuple[OpenLoop, ...], ScaleCut | None]:
-    """Returns the loops of a walk that are open, and the cut where its scale is known least."""
+    """Returns the loops of a walk that are open, and the cut where its scale is known least.
+
+    Of panoramas also that where one of them is a hinge, in any order.
+    """
+    hinge = None
+    if any(map(is_panorama, model.cameras.values())):
+        rows = np.flatnonzero(evidence.registered & (evidence.points > 0))
+        hinge = find_hinge(
+            model, [evidence.names[row] for row in rows], evidence.shared[np.ix_(rows, rows)])
     if order is None:
-        return (), None
+        return (), hinge
     loops = find_open_loops(evidence, order)
     walk = [evidence.names[row] for row in order if evidence.points[row]]
     ends = (loops[0].first, loops[0].second) if loops else None
-    return loops, find_weakest_scale(model, walk, between=ends)
+    cuts = [cut for cut in (find_weakest_scale(model, walk, between=ends), hinge) if cut]
+    return loops, max(cuts, key=lambda cut: cut.error, default=None)
 
 
 def has_drifted(verdict: ModelVerdict) -> bool:

@@ -20,7 +20,7 @@ from recon_cli.errors import InputError
 from recon_cli.io.tracks import TRACKS
 from recon_cli.sfm.segments import MOST_UNSPLIT
 from recon_cli.workspace import records as store
-from recon_cli.workspace.records import FrameList
+from recon_cli.workspace.records import FrameList, Group
 from recon_cli.workspace.summaries import IngestSummary
 
 MIN_TRAINED = 2  # one view holds no depth
@@ -41,6 +41,7 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     store.prepare_frames_folder(out)
     parts = _ingest(config, inputs.sources, out, ctx)
     source = merge_sources(parts)
+    _refuse_mixed(source)
     held_out = _choose_held_out(source, config, ctx)
     _check_split(source, held_out, config, ctx)
     frames = tuple(replace(frame, held_out=frame.name in held_out) for frame in source.frames)
@@ -59,6 +60,21 @@ def run(config: IngestConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         points=None if poses is None or poses.points is None else len(poses.points),
         frames=len(frames), held_out=sum(frame.held_out for frame in frames),
         groups=len(source.groups), width=largest.width, height=largest.height)
+
+
+def _refuse_mixed(source: IngestedSource) -> None:
+    """Raises InputError for panoramas together with pictures of ordinary lenses."""
+    panoramas = [group.name for group in source.groups if _is_panorama(group)]
+    others = [group.name for group in source.groups if not _is_panorama(group)]
+    if panoramas and others:
+        raise InputError(
+            f"{panoramas[0]} holds 360-degree panoramas, but {others[0]} pictures of ordinary "
+            "lenses; their cameras are not found together.",
+            hint="Give one of both, or reconstruct each in a workspace of its own (-w).")
+
+
+def _is_panorama(group: Group) -> bool:
+    return group.lens is not None and group.lens.is_panorama
 
 
 def _choose_held_out(

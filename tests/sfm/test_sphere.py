@@ -104,3 +104,36 @@ def test_the_scale_of_a_walk_is_known_the_worse_the_less_exact_its_places_are(tm
         errors.append(cut.error)
     assert 0 < errors[0] < 0.02
     assert errors[1] == pytest.approx(2 * errors[0], rel=0.2)
+
+
+def joined_by_a_hinge(model, common):
+    """The model with points that the panoramas on one side of the sixth see alone, but for some."""
+    joined = pycolmap.Reconstruction(model)
+    for place, number in enumerate(sorted(joined.points3D)):
+        if place < common:
+            continue
+        hidden = range(7, 13) if place % 2 else range(1, 6)
+        seen = [(element.image_id, element.point2D_idx)
+                for element in joined.point3D(number).track.elements]
+        for image, spot in seen:
+            if image in hidden:
+                joined.delete_observation(image, spot)
+    return joined
+
+
+def test_two_groups_that_meet_in_one_panorama_have_scales_of_their_own(captured):
+    job, model = captured
+    verdict = examine(joined_by_a_hinge(model, 0), job.database, job.names)
+    assert verdict.scale is not None
+    assert verdict.scale.error > 1
+    assert set(verdict.scale.sides) == {job.names[:5], (*job.names[6:], job.names[5])} or set(
+        verdict.scale.sides) == {job.names[6:], (*job.names[:5], job.names[5])}
+    assert any("The scale of the" in problem for problem in verdict.problems)
+
+
+def test_points_that_both_groups_see_give_them_one_scale(captured):
+    job, model = captured
+    verdict = examine(joined_by_a_hinge(model, 12), job.database, job.names)
+    assert verdict.scale is not None
+    assert verdict.scale.error < 0.05
+    assert examine(joined_by_a_hinge(model, 100), job.database, job.names).scale is None

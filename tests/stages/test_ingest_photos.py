@@ -418,6 +418,17 @@ def test_panoramas_are_not_taken_for_photos(tmp_path, notices):
     assert (mask[56:] == 0).all()  # 25 degrees around the lowest point are 8.9 rows
 
 
+def test_panoramas_and_photos_as_two_inputs_are_refused(tmp_path):
+    photos = write_photos(tmp_path / "photos", 3)
+    xmp = b'<r GPano:ProjectionType="equirectangular"/>'
+    (tmp_path / "panoramas").mkdir()
+    for index in range(3):
+        Image.fromarray(blocks(64, 128, seed=9 + index)).save(
+            tmp_path / "panoramas" / f"{index}.jpg", xmp=xmp)
+    with pytest.raises(InputError, match=r"panoramas holds 360-degree panoramas, but photos"):
+        take((photos, tmp_path / "panoramas"), tmp_path / "out")
+
+
 def test_a_cropped_panorama_is_used_in_its_place_of_the_sphere(tmp_path):
     folder = tmp_path / "room"
     folder.mkdir()

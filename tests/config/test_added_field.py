@@ -1,0 +1,24 @@
+"""A field that is added later leaves results from before it fresh."""
+
+from dataclasses import dataclass
+
+from recon_cli.config.fields import StageConfig, option
+from recon_cli.config.stages import IngestConfig
+
+
+@dataclass(frozen=True)
+class Config(StageConfig):
+    """A stage whose second field is newer than its results."""
+
+    old: int = option(1, "Old.")
+    new: str = option("auto", "New.", choices=("auto", "other"), added=True)
+
+
+def test_an_added_field_is_hashed_only_where_it_is_not_its_default():
+    assert Config().hashed_fields() == {"old": 1}
+    assert Config(new="other").hashed_fields() == {"old": 1, "new": "other"}
+
+
+def test_the_camera_of_ingest_is_such_a_field():
+    assert "camera" not in IngestConfig().hashed_fields()
+    assert IngestConfig(camera="equirectangular").hashed_fields()["camera"] == "equirectangular"
