@@ -218,3 +218,29 @@ def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(t
     middle = mask.shape[1] // 2
     assert not mask[:, :middle - 1].any()
     assert mask[:, middle + 1:].all()
+
+
+def tracked(base, viewmats):
+    """Writes poses as a phone tracks them: in metres, with up."""
+    KnownPoses(viewmats, True, up=(0.0, 0.0, 1.0), accuracy="tracked").write(base / "ingest")
+
+
+@pytest.mark.integration
+def test_tracked_poses_are_refined_and_give_metres_and_up(room, truth, given, tmp_path):
+    noise = np.random.default_rng(0)
+    tracked(room, {name: shaken(viewmat, noise) for name, viewmat in truth.items()})
+    summary = run(room, tmp_path / "out")
+    assert summary.poses.use == "auto"
+    assert summary.poses.held == 0
+    assert summary.world.evidence.metres
+    assert summary.world.evidence.axis == "data set"
+    np.testing.assert_allclose(steps(found(tmp_path / "out")), steps(truth), rtol=0.05)
+
+
+@pytest.mark.integration
+def test_tracked_poses_of_another_capture_are_not_used(room, truth, given, tmp_path):
+    tracked(room, {name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()})
+    summary = run(room, tmp_path / "out", min_registered=0.3)
+    assert summary.poses.use == "refuted"
+    assert not summary.world.evidence.metres
+    assert any("from the pictures alone" in line for line in summary.lines)
