@@ -42,9 +42,11 @@ def truth(shared_data):
 @pytest.fixture
 def given(room):
     """Writes poses, and points, into ingest; they are gone after the test."""
-    def write(viewmats, points=None):
+    def write(viewmats, points=None, *, tracked=False):
         colors = None if points is None else np.full((len(points), 3), 128, np.uint8)
-        KnownPoses(viewmats, True, points, colors).write(room / "ingest")
+        KnownPoses(
+            viewmats, True, points, colors, up=(0.0, 0.0, 1.0) if tracked else None,
+            accuracy="tracked" if tracked else "solved").write(room / "ingest")
 
     yield write
     for path in (room / "ingest").glob("po*s.*"):
@@ -220,15 +222,10 @@ def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(t
     assert mask[:, middle + 1:].all()
 
 
-def tracked(base, viewmats):
-    """Writes poses as a phone tracks them: in metres, with up."""
-    KnownPoses(viewmats, True, up=(0.0, 0.0, 1.0), accuracy="tracked").write(base / "ingest")
-
-
 @pytest.mark.integration
 def test_tracked_poses_are_refined_and_give_metres_and_up(room, truth, given, tmp_path):
     noise = np.random.default_rng(0)
-    tracked(room, {name: shaken(viewmat, noise) for name, viewmat in truth.items()})
+    given({name: shaken(viewmat, noise) for name, viewmat in truth.items()}, tracked=True)
     summary = run(room, tmp_path / "out")
     assert summary.poses.use == "auto"
     assert summary.poses.held == 0
@@ -239,7 +236,8 @@ def test_tracked_poses_are_refined_and_give_metres_and_up(room, truth, given, tm
 
 @pytest.mark.integration
 def test_tracked_poses_of_another_capture_are_not_used(room, truth, given, tmp_path):
-    tracked(room, {name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()})
+    given({name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()},
+          tracked=True)
     summary = run(room, tmp_path / "out", min_registered=0.3)
     assert summary.poses.use == "refuted"
     assert not summary.world.evidence.metres
