@@ -52,14 +52,17 @@ def refuse_other_file(path: Path) -> None:
         if (path.parent / path.name.split(".")[0]).is_file():
             folder = shlex.quote(f"{path}.d")
         unpack = command.format(file=shlex.quote(str(path)), folder=folder)
-        kind = "a recording of Record3D, a packed archive" if suffix == ".r3d" else "an archive"
         raise InputError(
-            f"{path} is {kind}, not a video.", hint="Unpack it, and give the folder: "
+            f"{path} is an archive, not a video.", hint="Unpack it, and give the folder: "
             + _UNPACK.format(folder=folder, command=unpack))
     if suffix in _MESHES:
         raise InputError(f"{path} is a mesh or a point cloud, not a capture.",
                          hint="Give the video or the photos that it was made from.")
     found = recognise_file(path)
+    if found is not None and found.row.layout:
+        raise InputError(
+            f"{path} belongs to {found.row.words}; needed is the folder with all its files.",
+            hint=f"Give the folder: recon ingest {shlex.quote(str(path.parent))}.")
     if found is not None:
         raise InputError(
             f"{path} is {found.row.words}, which are not read; needed are the pictures.",

@@ -1,7 +1,8 @@
-"""One table of the files of other programs that lie beside pictures and are not read.
+"""One table of the files of other programs that lie beside pictures.
 
 A row holds a description, how the file is recognised, its content and the command to type instead.
-A new reader for one of them replaces its row. Data sets that are read are in `layouts`.
+What is read as a data set, by `datasets.layouts`, has the name of its layout: it is named where
+files of it are missing, or where only its pictures were given.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ _TRIED = 50  # files of a pattern; a capture has thousands of one kind
 _LISTED = 0.5  # a text that names this share of the pictures belongs to them
 _TEXTS = frozenset({".csv", ".json", ".jsonl", ".tsv", ".txt", ".xml", ".yaml", ".yml"})
 _ARRAYS = frozenset({".bin", ".geojson", ".npy", ".npz", ".traj", ".tum"})
-_NERFSTUDIO = "ns-process-data {kind} --data {folder} {more}--output-dir SCENE"
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,7 @@ class ForeignLayout:
     photos: tuple[str, ...] = ()  # folders with its photos, the best first
     not_photos: tuple[str, ...] = ()  # patterns of pictures that are none of the scene
     video: str = ""  # name of its video
-
-
-def _nerfstudio(kind: str, more: str = "") -> str:
-    return _NERFSTUDIO.format(kind=kind, folder="{folder}", more=more)
+    layout: str = ""  # of `datasets.layouts`, which reads it if it is complete
 
 
 # In this order; a file that one row has recognised is not looked at for another.
@@ -46,29 +43,29 @@ FOREIGN: tuple[ForeignLayout, ...] = (
     ForeignLayout(
         "the raw data of Polycam", "poses and depth",
         tuple(f"{place}{kind}cameras/*.json" for place in ("keyframes/", "")
-              for kind in ("corrected_", "")), (b'"t_00"',), _nerfstudio("polycam"),
+              for kind in ("corrected_", "")), (b'"t_00"',), layout="polycam",
         photos=tuple(f"{place}{kind}images" for place in ("keyframes/", "")
                      for kind in ("corrected_", "")),
         not_photos=("thumbnail.*", "*/thumbnail.*"), video="polycam.mp4"),
     ForeignLayout(
         "an export of Record3D", "poses and depth",
         ("metadata.json", "metadata", "EXR_RGBD/metadata.json"), (b'"poses"', b'"K"'),
-        _nerfstudio("record3d"), photos=("rgb", "rgbd", "EXR_RGBD/rgb"), not_photos=("icon",)),
+        layout="record3d", photos=("rgb", "rgbd", "EXR_RGBD/rgb"), not_photos=("icon",)),
     ForeignLayout(
         "a recording of Stray Scanner", "poses and depth", ("odometry.csv",), (b"qx",),
-        video="rgb.mp4"),
+        video="rgb.mp4", layout="stray"),
     ForeignLayout(
         "a scan of 3D Scanner App", "poses and depth", ("frame_*.json",),
-        (b'"cameraPoseARFrame"',),
+        (b'"cameraPoseARFrame"',), layout="3dscannerapp",
         not_photos=("depth_*", "conf_*", "thumb_*", "texture*")),
     ForeignLayout(
         "a recording of ARKitScenes", "poses and depth",
-        ("lowres_wide.traj", "*_frames/lowres_wide.traj", "*.traj"),
+        ("lowres_wide.traj", "*_frames/lowres_wide.traj", "*.traj"), layout="arkitscenes",
         photos=tuple(f"{place}{kind}" for kind in ("wide", "vga_wide", "lowres_wide")
                      for place in ("", "*_frames/"))),
     ForeignLayout(
         "an export of RTAB-Map", "poses and depth", ("*camera_poses*.txt", "*_poses.txt"),
-        (b"#timestamp",), photos=("*_rgb", "*_left")),
+        (b"#timestamp",), layout="rtabmap", photos=("*_rgb", "*_left")),
     ForeignLayout(
         "a database of RTAB-Map", "poses and pictures", ("*.db",),
         (b"SQLite format 3", b"CREATE TABLE Node", b"CREATE TABLE Link"),
@@ -77,15 +74,13 @@ FOREIGN: tuple[ForeignLayout, ...] = (
         "a recording of a Quest headset", "poses, depth and raw pictures",
         ("*_camera_mruk_intrinsics.json", "*_camera_characteristics.json", "hmd_poses.csv"),
         advice="convert it to a COLMAP model with e2e_quest_to_colmap.py of "
-        "metaquest-3d-reconstruction"),
+        "metaquest-3d-reconstruction", layout="quest"),
     ForeignLayout(
         "the cameras of Agisoft Metashape", "poses", ("*.xml",),
-        (b"<document", b"<chunk", b"<camera"), _nerfstudio("metashape", "--xml {file} ")),
+        (b"<document", b"<chunk", b"<camera"), layout="metashape"),
     ForeignLayout(
         "the cameras of RealityScan or RealityCapture", "poses", ("*.csv",),
-        (b"name", b"alt", b"heading", b"pitch", b"roll"),
-        _nerfstudio("realitycapture", "--csv {file} "),
-        "export the registration in COLMAP's format"),
+        (b"name", b"alt", b"heading", b"pitch", b"roll"), layout="realityscan"),
     ForeignLayout(
         "sidecars of RealityScan or RealityCapture", "poses", ("*.xmp", "*/*.xmp"),
         (b"xcr:Rotation",), advice="export the registration in COLMAP's format"),
@@ -93,15 +88,14 @@ FOREIGN: tuple[ForeignLayout, ...] = (
         "the cameras of ContextCapture or iTwin Capture", "poses", ("*.xml",),
         (b"<BlocksExchange",)),
     ForeignLayout("cameras in Bundler's format", "poses", ("bundle.out", "*.out", "*/bundle.out"),
-                  (b"# Bundle file",)),
-    ForeignLayout("the cameras of an LLFF scene", "poses", ("poses_bounds.npy",),
-                  advice="copy the COLMAP model that they were made from, sparse/0, as well"),
-    ForeignLayout("the cameras of OpenDroneMap", "poses", ("odm_report/shots.geojson",), (),
-                  _nerfstudio("odm")),
+                  (b"# Bundle file",), layout="bundler"),
+    ForeignLayout("the cameras of an LLFF scene", "poses", ("poses_bounds.npy",), layout="llff"),
+    ForeignLayout("the cameras of OpenDroneMap", "poses", ("odm_report/shots.geojson",),
+                  layout="opensfm"),
     ForeignLayout(
         "the cameras of OpenSfM or OpenDroneMap", "poses",
         ("reconstruction.json", "opensfm/reconstruction.json", "shots.geojson"), (b"shot",),
-        advice="export a COLMAP model with `opensfm export_colmap`"),
+        layout="opensfm"),
     ForeignLayout(
         "the cameras of Meshroom", "poses", ("*.sfm", "*/*.sfm"), (b'"views"', b'"poses"'),
         "aliceVision_exportColmap -i {file} -o SCENE"),
@@ -151,9 +145,8 @@ class Found:
             ("folder", self.folder), ("file", self.path), ("parent", self.path.parent))}
         steps = []
         if self.row.convert:
-            maker = " of nerfstudio" * self.row.convert.startswith("ns-")
             then = ", then `recon ingest SCENE`" * ("SCENE" in self.row.convert)
-            steps.append(f"`{self.row.convert.format(**names)}`{maker}{then}")
+            steps.append(f"`{self.row.convert.format(**names)}`{then}")
         if self.row.advice:
             steps.append(self.row.advice.format(**names))
         return f"To use them: {', or '.join(steps)}." if steps else ""
@@ -161,6 +154,14 @@ class Found:
     def notice(self, where: Path) -> str:
         """Returns a notice for the user; `where` is the input that they gave."""
         place = self.place if self.folder == where else self.path
+        if self.row.layout and self.folder != where:
+            whole = shlex.quote(str(self.folder))
+            return (f"{place} is {self.row.words}: its {self.row.carries} are not used with "
+                    f"these pictures alone; recon ingest {whole} uses them.")
+        if self.row.layout:
+            return (f"{place} is {self.row.words}, but files that belong to it are missing or in "
+                    f"another place: its {self.row.carries} are not read, and the cameras are "
+                    "found from the pictures. docs/captures.md lists what belongs to it.")
         return (f"{place} is {self.row.words}: its {self.row.carries} are not read, and "
                 f"the cameras are found from the pictures. {self.advice()}").rstrip()
 

@@ -119,8 +119,13 @@ def _describe_aside(
                    "geometry are found from the photos alone.")
 
 
-def describe_unused(folder: Path, used: Collection[Path], layout: str) -> list[str]:
-    """Returns the unused files in the folder of a data set: depth, masks, other poses."""
+def describe_unused(
+    folder: Path, used: Collection[Path], layout: str, words: str
+) -> list[str]:
+    """Returns the unused files in the folder of a data set: depth, masks, other poses.
+
+    `layout` is the name of its layout, `words` what that is called in a sentence.
+    """
     notices = []
     for path in _subfolders(folder, None):
         kind, count = picture_kind(path.name), _count_pictures(path)
@@ -129,8 +134,9 @@ def describe_unused(folder: Path, used: Collection[Path], layout: str) -> list[s
             notices.append(f"{path.name}/ holds {count} {kind}, by its name, and is not used" + (
                 f": masks are read from {folder}/masks/." if kind == "masks" else "."))
     notices += [f"{found.place} is {found.row.words} and is not used: the folder is read as "
-                f"{layout}." for found in find_foreign(folder, known=used)
-                if found.row.marks and b'"transform_matrix"' not in found.row.marks]
+                f"{words}." for found in find_foreign(folder, known=used)
+                if found.row.layout != layout
+                and found.row.marks and b'"transform_matrix"' not in found.row.marks]
     return notices
 
 

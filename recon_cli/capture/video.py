@@ -12,7 +12,7 @@ import re
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import av
@@ -26,6 +26,7 @@ from recon_cli.capture.decoded_picture import (
     UNSUPPORTED_MATRICES,
     DecodedPicture,
     Gap,
+    Orientation,
     Tags,
     deinterlace,
     read_tags,
@@ -210,6 +211,49 @@ def frames_at(
     raise InputError(
         f"{path} ended before frame {min(missing)}, which the first pass had read.",
         hint="Do not change the file while it is read, then run the same command again.")
+
+
+def stored_frames(
+    path: Path, numbers: Collection[int], *, threads: int
+) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Yields (number, RGB [H, W, 3] as stored, not turned) in ascending order; None where lost.
+
+    Numbers are places in the order of presentation, counted by the packets, so that a frame that
+    cannot be decoded does not move those after it.
+    """
+    wanted = sorted(set(numbers))
+    places = {pts: at for at, pts in enumerate(_presentation_times(path))}
+    at, waiting = -1, iter(wanted)
+    number = next(waiting, None)
+    for item in decode(path, threads=threads):
+        if number is None:
+            return
+        if isinstance(item, Gap):
+            at += not places
+            continue
+        at = places.get(item.frame.pts, at + 1) if item.frame.pts is not None else at + 1
+        while number is not None and number < at:
+            yield number, None
+            number = next(waiting, None)
+        if number == at:
+            yield at, replace(item, tags=replace(item.tags, orientation=Orientation())).rgb()
+            number = next(waiting, None)
+    while number is not None:
+        yield number, None
+        number = next(waiting, None)
+
+
+def _presentation_times(path: Path) -> list[int]:
+    """Returns the times of all packets that are shown, in order; empty if they have none."""
+    with open_video(path) as (container, stream):
+        try:
+            times = [packet.pts for packet in container.demux(stream)
+                     if packet.size and not packet.is_discard]
+        except av.error.FFmpegError:
+            return []
+    if None in times or len(set(times)) < len(times):
+        return []
+    return sorted(time for time in times if time is not None)
 
 
 def _decode_frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame | Gap]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from recon_cli.config.fields import StageConfig, option
 from recon_cli.errors import ConfigError
 from recon_cli.workspace.atomic import read_json
-from recon_cli.workspace.export_formats import EXPORT_FORMATS, describe_max_loss
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, OTHER_NAMES, describe_max_loss
 
 SCALE_BETWEEN = (
     "Set the scale: A and B are METRES apart. Each is a frame name (its camera), x,y,z (a point of "
@@ -420,12 +420,14 @@ class ExportConfig(StageConfig):
             raise self._error("crop", list(self.crop), "a lowest and a highest corner")
         for name in self.formats:
             if name not in EXPORT_FORMATS:
-                raise self._error("format", name, "one of " + ", ".join(EXPORT_FORMATS))
+                raise self._error(
+                    "format", name, "one of " + ", ".join([*EXPORT_FORMATS, *OTHER_NAMES]))
 
     @property
     def formats(self) -> tuple[str, ...]:
         """The names in `format`, each once."""
-        return tuple(dict.fromkeys(name.strip() for name in self.format.split(",")))
+        names = (name.strip() for name in self.format.split(","))
+        return tuple(dict.fromkeys(OTHER_NAMES.get(name, name) for name in names))
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,11 @@ class DepthFile:
         """Returns [h, w] of LOW, MEDIUM and HIGH, None where the data set has none."""
         return None if self.confidence is None else self.confidence(*self.read().shape)
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that are read."""
+        return (self.path, *([self.confidence.path] if self.confidence else []))
+
     def own_lens(self, width: int, height: int) -> Lens:
         """Returns the intrinsics of the depth map, of this size."""
         own = self.own if self.own is not None else self.lens.resized(width, height)

@@ -40,7 +40,7 @@ def points_from_depth(
             f"None of the {len(images)} frames with depth has any above 0.",
             hint="Check the depth files and their scale.")
     colors = np.concatenate([color for _, color in clouds])
-    rows = _thin(points, max_points)
+    rows = thin_points(points, max_points)
     return points[rows], colors[rows]
 
 
@@ -71,7 +71,7 @@ def _read_rgb(image: PosedImage) -> NDArray[np.uint8]:
     return np.asarray(data[:, :, ::-1], np.uint8)
 
 
-def _thin(points: NDArray[np.float64], max_points: int) -> NDArray[np.intp]:
+def thin_points(points: NDArray[np.float64], max_points: int) -> NDArray[np.intp]:
     """Returns the indices of one point for each voxel, of the smallest voxels that allow it."""
     if len(points) <= max_points:
         return np.arange(len(points))

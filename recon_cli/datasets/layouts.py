@@ -1,4 +1,7 @@
-"""The layouts of data sets with poses, recognised by names of files and folders alone."""
+"""The layouts of data sets with poses, recognised by their files and folders.
+
+docs/captures.md lists every row; a test compares them.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from recon_cli.capture.mask_files import mask_folders, match_masks
+from recon_cli.datasets.arkit_scenes import is_arkit_scenes, read_arkit_scenes
+from recon_cli.datasets.bundler import is_bundler, read_bundler
 from recon_cli.datasets.colmap import is_colmap, lacks_cameras, read_colmap
 from recon_cli.datasets.kinect import (
     find_unposed,
@@ -15,7 +20,16 @@ from recon_cli.datasets.kinect import (
     read_seven_scenes,
     read_tum,
 )
+from recon_cli.datasets.llff import is_llff, read_llff
+from recon_cli.datasets.metashape import is_metashape, read_metashape
+from recon_cli.datasets.nerfcapture import is_nerfcapture, read_nerfcapture
+from recon_cli.datasets.opensfm import is_opensfm, read_opensfm
+from recon_cli.datasets.packed import is_packed
+from recon_cli.datasets.polycam import is_polycam, read_polycam
 from recon_cli.datasets.posed import PosedSet
+from recon_cli.datasets.quest import is_quest, read_quest
+from recon_cli.datasets.reality_scan import is_reality_scan, read_reality_scan
+from recon_cli.datasets.record3d import is_record3d, read_record3d
 from recon_cli.datasets.rgbd import (
     is_replica,
     is_scannet,
@@ -23,6 +37,9 @@ from recon_cli.datasets.rgbd import (
     read_replica,
     read_scannet,
 )
+from recon_cli.datasets.rtabmap import is_rtabmap, read_rtabmap
+from recon_cli.datasets.scanner_app import is_scanner_app, read_scanner_app
+from recon_cli.datasets.stray_scanner import is_stray, read_stray
 from recon_cli.datasets.transforms import is_transforms, read_transforms
 from recon_cli.errors import FormatError, InputError, format_count, list_names
 
@@ -49,16 +66,45 @@ LAYOUTS: tuple[Layout, ...] = (
            read_seven_scenes),
     Layout("tum", "a TUM RGB-D sequence", "rgb/, rgb.txt and groundtruth.txt, with depth/ or "
            "without", is_tum, read_tum),
+    Layout("polycam", "a raw export of Polycam", "keyframes/ with images/, cameras/, depth/ and "
+           "confidence/", is_polycam, read_polycam),
+    Layout("record3d", "a recording of Record3D", "rgb/, depth/ and metadata.json; or an .r3d",
+           is_record3d, read_record3d),
+    Layout("stray", "a recording of Stray Scanner", "rgb.mp4, odometry.csv and camera_matrix.csv",
+           is_stray, read_stray),
+    Layout("3dscannerapp", "a scan of 3D Scanner App", "frame_00000.jpg and frame_00000.json",
+           is_scanner_app, read_scanner_app),
+    Layout("arkitscenes", "a recording of ARKitScenes", "lowres_wide.traj, lowres_wide/ and "
+           "lowres_wide_intrinsics/", is_arkit_scenes, read_arkit_scenes),
+    Layout("rtabmap", "an export of RTAB-Map", "NAME_rgb/, NAME_calib/ and NAME_camera_poses.txt",
+           is_rtabmap, read_rtabmap),
+    Layout("quest", "a recording of a Quest headset (MRUK)", "left_camera_mruk_rgba/, "
+           "left_camera_mruk_intrinsics.json and left_camera_mruk_frame_metadata.csv", is_quest,
+           read_quest),
+    Layout("nerfcapture", "a capture of NeRFCapture", "transforms.json with depth_path",
+           is_nerfcapture, read_nerfcapture),
     Layout("transforms", "a transforms.json data set (nerfstudio, instant-ngp)",
            "transforms.json, or transforms_train.json, and the images", is_transforms,
            read_transforms),
     Layout("colmap", "a COLMAP model", "images/ and sparse/0/", is_colmap, read_colmap),
+    Layout("realityscan", "photos with cameras of RealityScan (RealityCapture, Postshot)",
+           "a .csv with name, x, y, alt, heading, pitch, roll and f", is_reality_scan,
+           read_reality_scan),
+    Layout("metashape", "photos with cameras of Metashape", "an .xml of Export Cameras",
+           is_metashape, read_metashape),
+    Layout("bundler", "photos with cameras of Bundler", "bundle.out and list.txt", is_bundler,
+           read_bundler),
+    Layout("opensfm", "photos with cameras of OpenSfM or OpenDroneMap", "reconstruction.json, or "
+           "cameras.json and odm_report/shots.geojson", is_opensfm, read_opensfm),
+    Layout("llff", "an LLFF scene", "poses_bounds.npy and images/", is_llff, read_llff),
 )
+PACKED = "record3d"  # the layout of what `packed` unpacks
 
 
 def recognise(path: Path) -> str | None:
     """Returns the name of the layout that a path has, None where it has no known one."""
-    return next((row.name for row in LAYOUTS if row.fits(path)), None)
+    found = next((row.name for row in LAYOUTS if row.fits(path)), None)
+    return PACKED if found is None and is_packed(path) else found
 
 
 def refuse_incomplete(path: Path) -> None:

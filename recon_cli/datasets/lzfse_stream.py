@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 
 _END = b"bvx$"
+_SHORTEST = 32  # bytes of a packed header
 _WORDS = struct.Struct("<II")
 
 
@@ -42,7 +43,10 @@ def _decoded_size(data: bytes) -> int:
             elif kind == b"bvx2":  # LZFSE with a packed header
                 fields = struct.unpack_from("<QQQ", data, at + 8)
                 literals, matches = fields[0] >> 20 & 0xFFFFF, fields[1] >> 40 & 0xFFFFF
-                at += (fields[2] & 0xFFFFFFFF) + literals + matches
+                header = fields[2] & 0xFFFFFFFF
+                if header < _SHORTEST:  # it would never end
+                    raise ValueError("its LZFSE stream is damaged")
+                at += header + literals + matches
             elif kind == b"bvx1":  # LZFSE with a plain header, of 772 bytes
                 literals, matches = struct.unpack_from("<II", data, at + 20)
                 at += 772 + literals + matches

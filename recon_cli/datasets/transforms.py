@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from recon_cli.datasets.depth_file import DepthFile
+from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.posed import (
     PosedImage,
@@ -149,7 +150,7 @@ def read_transforms(path: Path) -> PosedSet:
     lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
     finder = FileFinder(path.parent if path.is_file() else path, [
         entry[key] for _, _, (_, entries) in lists for entry in entries
-        for key in ("file_path", "depth_file_path", "mask_path") if key in entry])
+        for key in ("file_path", "depth_file_path", "depth_path", "mask_path") if key in entry])
     for file, part, (common, entries) in lists:
         frames += _list_entries(file, part, common, entries, finder)
     frames, notices = _drop_duplicates(frames)
@@ -167,20 +168,24 @@ def read_transforms(path: Path) -> PosedSet:
             missing.append(name)
     posed = find_images("transforms", listed, path, missing=missing)
     points, colors, point_notices = _read_points(path if path.is_file() else path / _FILE)
-    notices += [*finder.notices(), *_describe_unread(used)]
+    notices += [*finder.notices(), *_describe_unread(used, listed)]
     return replace(
         posed, metric=any(image.depth is not None for image in posed.images),
         splits=any(image.held_out for image in posed.images), points=points, colors=colors,
         notices=(*notices, *posed.notices, *point_notices))
 
 
-def _describe_unread(frames: Sequence[_Frame]) -> list[str]:
-    """Returns a notice about depth that is named by another key than nerfstudio's."""
-    other = sum(frame.entry.get("depth_path") is not None
-                and frame.entry.get("depth_file_path") is None for frame in frames)
-    return [f"{other} frames name their depth by depth_path, as NeRFCapture does, which is not "
-            "read; depth_file_path is, with depth_unit_scale_factor, the metres of a value of 1"
-            ] * (other > 0)
+def _describe_unread(frames: Sequence[_Frame], listed: Sequence[PosedImage]) -> list[str]:
+    """Returns a notice about depth of NeRFCapture that is not read."""
+    other = [frame for frame in frames if frame.entry.get("depth_path") is not None
+             and frame.entry.get("depth_file_path") is None]
+    unread = len(other) - sum(image.depth is not None for image in listed)
+    if not other or unread <= 0:
+        return []
+    why = ("its unit is not given by integer_depth_scale"
+           if other[0].entry.get("integer_depth_scale") is None
+           else "files are missing, or have 8 bits, in which depth beyond a metre is cut off")
+    return [f"the depth of {format_count(unread, 'frame')} is not read: {why}"]
 
 
 def _files(path: Path) -> list[tuple[Path, str | None]]:
@@ -285,11 +290,34 @@ def _list_frame(frame: _Frame, name: str, held_out: str, finder: FileFinder) -> 
     viewmat = viewmat_from_pose(
         frame.entry.get("transform_matrix", ()), f"{frame.where} transform_matrix", opengl=True)
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
-    depth, unit = _beside(frame, "depth_file_path", finder), _unit(frame)
+    time = frame.entry.get("timestamp")
     return PosedImage(
         name, frame.path, lens, viewmat, frame.part == held_out,
-        None if depth is None else DepthFile(depth, unit, lens),
-        _beside(frame, "mask_path", finder))
+        _find_depth(frame, lens, finder), _beside(frame, "mask_path", finder),
+        time=float(time) if isinstance(time, (int, float)) else None)
+
+
+def _find_depth(frame: _Frame, lens: Lens, finder: FileFinder) -> DepthFile | None:
+    """Returns the depth of a frame: nerfstudio's, else NeRFCapture's if its unit is known."""
+    path = _beside(frame, "depth_file_path", finder)
+    if path is not None:
+        return DepthFile(path, _unit(frame), lens)
+    unit = read_number(frame.entry, "integer_depth_scale", frame.where)
+    if unit is None or unit <= 0 or frame.entry.get("depth_path") is None:
+        return None
+    path = finder.find(frame.entry["depth_path"], f"{frame.where} depth_path")
+    if not is_file(path) or not _has_16_bits(path):
+        return None
+    return DepthFile(path, unit, lens, reliable=LIDAR_RANGE)
+
+
+def _has_16_bits(path: Path) -> bool:
+    """Returns whether a picture has more than 8 bits; an unreadable one is reported later."""
+    try:
+        with Image.open(path) as image:
+            return image.mode not in ("1", "L", "P", "LA", "RGB", "RGBA")
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return True
 
 
 def _beside(frame: _Frame, key: str, finder: FileFinder) -> Path | None:
@@ -334,17 +362,26 @@ def _read_points(
     return points, colors, ()
 
 
+@dataclass(frozen=True)
+class DepthPaths:
+    """The files of depth, PNGs of 16 bits, by the paths of their images."""
+
+    files: Mapping[str, str]  # below the folder of the .json
+    unit: float  # world units of a value of 1
+
+
 def write_transforms(
     path: Path, views: Sequence[tuple[str, Camera]], *, held_out: Collection[str] = (),
-    points: str | None = None,
+    points: str | None = None, depth: DepthPaths | None = None,
 ) -> None:
     """Writes the cameras of images, by paths below the folder of the file, atomically.
 
     Intrinsics that all cameras share are written once. With held-out paths the lists
     train_filenames, val_filenames and test_filenames are written; the last two are those images,
     because nerfstudio requires both. `points` is the name of a point cloud beside the file, in the
-    same world, where nerfstudio starts Gaussians. InputError if there are no views; ValueError if
-    a path leaves the folder, appears twice, or is held out but no view.
+    same world, where nerfstudio starts Gaussians; `depth` has a file for every image. InputError if
+    there are no views; ValueError if a path leaves the folder, appears twice, or is held out but no
+    view.
     """
     if not views:
         raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
@@ -359,12 +396,15 @@ def write_transforms(
     value: dict[str, Any] = {"camera_model": "PINHOLE", **(inner[0] if shared else {})}
     if points is not None:
         value["ply_file_path"] = points
+    if depth is not None:
+        value["depth_unit_scale_factor"] = depth.unit
     if held_out:
         test = [name for name in names if name in held_out]
         value |= {"train_filenames": [name for name in names if name not in held_out],
                   "val_filenames": test, "test_filenames": test}
     value["frames"] = [
         {"file_path": name, **({} if shared else intrinsics),
+         **({} if depth is None else {"depth_file_path": depth.files[name]}),
          "transform_matrix": pose_from_viewmat(camera.viewmat).tolist()}
         for (name, camera), intrinsics in zip(views, inner, strict=True)]
     write_json(path, value)

@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import shutil
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from recon_cli.config.stages import ExportConfig
-from recon_cli.datasets.transforms import write_transforms
 from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.export.camera_files import write_cameras
 from recon_cli.export.reduce import lower_degrees
 from recon_cli.export.source import ExportSource
 from recon_cli.export.verify import file_size, measure_size, write_until_good
-from recon_cli.io.colmap import write_colmap
-from recon_cli.io.meshes import write_point_cloud
 from recon_cli.room.files import write_mesh_file, write_plan
 from recon_cli.room.measures import RoomFrame
 from recon_cli.room.mesh import MeshResult, build_mesh
-from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import write_points
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
 from recon_cli.workspace.export_record import ExportedFile, max_loss_db
-
-_IMAGES = "images"
-_SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
 
 logger = logging.getLogger("recon")
 
@@ -71,7 +64,7 @@ class FormatWriter:
                 inside = self._splats.within(*self._source.room)
                 write_points(self._out / row.file, self._splats.select(inside))
             case "cameras":
-                _write_cameras(self._out, row, self._source)
+                write_cameras(self._out, row, self._source)
             case "mesh":
                 write_mesh_file(self._out / row.file, self._mesh, self._source.frame.up)
             case "plan":
@@ -115,30 +108,3 @@ class FormatWriter:
             self._splats.map(lambda tensor: tensor.to(source.ctx.device)), source.load_training(),
             source.points if measured else None, source.ctx,
             max_triangles=self._config.max_triangles, voxel=self._config.voxel)
-
-
-def _write_cameras(out: Path, row: ExportFormat, source: ExportSource) -> None:
-    """Writes the cameras in one of the formats of this kind, and copies the images."""
-    cameras, scene = _copy_images(out, source), source.scene
-    if row.index:  # a folder: a model of COLMAP
-        shutil.rmtree(out / row.file, ignore_errors=True)  # of a run that was killed
-        write_colmap(out / row.file, cameras, source.points, scene.colors)
-        return
-    points = None
-    if len(scene.points):
-        points = _SPARSE
-        write_point_cloud(out / points, source.points, scene.colors)
-    write_transforms(
-        out / row.file, [(f"{_IMAGES}/{name}", camera) for name, camera in cameras],
-        held_out={f"{_IMAGES}/{view.name}" for view in scene.test}, points=points)
-
-
-def _copy_images(out: Path, source: ExportSource) -> list[tuple[str, Camera]]:
-    """Copies the undistorted images, and returns all cameras, which are useless without."""
-    scene = source.scene
-    every = (*scene.train, *scene.validation, *scene.test)
-    for view in every:
-        target = out / _IMAGES / view.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(view.original, target)
-    return source.place(every)

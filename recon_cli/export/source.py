@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,14 @@ from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.format import Guide, WriteSettings
 from recon_cli.train.train_data import load_views, read_config
-from recon_cli.workspace.records import ImportRecord, has_views, read_frame_list
+from recon_cli.workspace.records import (
+    POSES,
+    ImportRecord,
+    has_views,
+    read_frame_list,
+    read_poses,
+)
+from recon_cli.workspace.summaries import WorldSummary
 
 
 class ExportSource:
@@ -75,6 +83,29 @@ class ExportSource:
     def points(self) -> NDArray[np.float64]:
         """The points [P, 3]."""
         return self._similarity.points(self.scene.points)
+
+    @property
+    def scale(self) -> float:
+        """Units of the files in one unit of the training."""
+        return self._similarity.scale
+
+    @cached_property
+    def in_metres(self) -> bool:
+        """Whether the capture came with metres, and the scene of the training is in metres."""
+        world, poses = WorldSummary.read(self._inputs.folders["sfm"]), self.ingest / POSES
+        return bool(world and world.evidence.metres and poses.exists()
+                    and read_poses(poses).metric)
+
+    @property
+    def known_up(self) -> NDArray[np.float64] | None:
+        """Up [3] in the world of the files, None where it is a guess."""
+        world = WorldSummary.read(self._inputs.folders["sfm"])
+        return self.frame.up if world and world.evidence.up_found else None
+
+    @property
+    def ingest(self) -> Path:
+        """The folder of ingest."""
+        return self._inputs.folders["ingest"]
 
     @property
     def room(self) -> tuple[list[float], float]:

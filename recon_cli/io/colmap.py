@@ -17,7 +17,7 @@ from PIL import Image, UnidentifiedImageError
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.io.colmap_library import pycolmap, write_model
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import Camera, Lens
 from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
 from recon_cli.workspace.paths import refuse_special
@@ -250,6 +250,55 @@ def write_colmap(
         partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def write_priors(
+    path: Path, views: Sequence[tuple[str, Camera]], *, deviation: float | None,
+    up: NDArray[np.float64] | None,  # [3] unit vector in the world
+) -> None:
+    """Writes a COLMAP database of the cameras, with their places and gravity as priors.
+
+    `deviation` is the standard deviation of a place in world units; None leaves it to COLMAP.
+    Gravity points down and is in the axes of the camera. Views are as in `write_colmap`.
+    """
+    model = _model(views)
+    partial = path.with_name(f".{path.name}.tmp{os.getpid()}")
+    partial.unlink(missing_ok=True)
+    try:
+        with pycolmap.Database.open(str(partial)) as database:
+            for camera in model.cameras.values():
+                database.write_camera(camera, use_camera_id=True)
+            for rig in model.rigs.values():
+                database.write_rig(rig, use_rig_id=True)
+            for number, (_, camera) in enumerate(views, start=1):
+                image = model.image(number)
+                database.write_image(image, use_image_id=True)
+                database.write_frame(model.frame(image.frame_id), use_frame_id=True)
+                database.write_pose_prior(_prior(image.data_id, camera, deviation, up))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _prior(
+    data_id: Any, camera: Camera, deviation: float | None, up: NDArray[np.float64] | None
+) -> pycolmap.PosePrior:
+    prior = pycolmap.PosePrior()
+    prior.corr_data_id = data_id
+    prior.position = camera.center
+    prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+    if deviation is not None:
+        prior.position_covariance = np.eye(3) * deviation**2
+    if up is not None:
+        prior.gravity = camera.viewmat[:3, :3] @ -up
+    return prior
+
+
+def project(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the pixels [M, 2] of points [M, 3] in a camera's axes, all before it."""
+    camera = pycolmap.Camera(
+        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+    return np.asarray(camera.img_from_cam(points))
 
 
 def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:

@@ -1,7 +1,8 @@
 """Sensor depth of ingested frames: one map a frame at the sensor's own size, with its confidence.
 
-ingest writes depth.json and depth/, for the frames that may be trained on. A map is a PNG of 16
-bits, named like its frame; levels of confidence (0 low, 1 medium, 2 high) lie beside it as 8 bits.
+ingest writes depth.json and depth/, for all frames that the data set itself does not hold out; who
+trains leaves out those that --holdout does. A map is a PNG of 16 bits, named like its frame; levels
+of confidence (0 low, 1 medium, 2 high) lie beside it as 8 bits.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from recon_cli.workspace.records import AGAIN
 
 DEPTH, LIST = "depth", "depth.json"
 _MOST = 65535  # value of 16 bits
+_WHOLE = 0.02  # of a unit: what float32 leaves of a multiple
 _CONFIDENCE = ".confidence.png"
 
 
@@ -42,14 +44,16 @@ def write_depth(
 ) -> DepthMap:
     """Writes the z-depth [h, w] of a frame in world units, 0 where unknown, and returns its record.
 
-    `unit` is kept if it can hold all values; else the largest value takes all 16 bits.
+    `unit` is kept if all values are multiples of it that fit; else the largest value takes all 16
+    bits.
     """
-    most = float(depth.max(initial=0))
-    if unit is None or most > _MOST * unit:
+    exact, most = depth.astype(np.float64), float(depth.max(initial=0))
+    if unit is None or most > _MOST * unit or np.abs(
+            exact / unit - np.rint(exact / unit)).max(initial=0) > _WHOLE:
         unit = most / _MOST if most > 0 else 1.0
     folder = stage / DEPTH
     folder.mkdir(parents=True, exist_ok=True)
-    write_png(folder / name, np.rint(depth.astype(np.float64) / unit).astype(np.uint16))
+    write_png(folder / name, np.rint(exact / unit).astype(np.uint16))
     if confidence is not None:
         write_png(_confidence(folder / name), confidence)
     return DepthMap(lens, unit, confidence is not None, reliable)

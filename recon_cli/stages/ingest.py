@@ -135,7 +135,7 @@ def _tell_foreign(video: Path, ctx: StageContext) -> None:
     if any(row.video == video.name for row in FOREIGN):
         for found in find_foreign(video.absolute().parent):
             if found.row.video == video.name:
-                ctx.notice(found.notice(video.absolute().parent))
+                ctx.notice(found.notice(video))
 
 
 def _parts(sources: Sequence[Path]) -> list[list[Path]]:

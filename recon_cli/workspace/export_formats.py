@@ -75,14 +75,17 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
         "lod/*",), options=("max_loss",), sharing=_SHARING),
     ExportFormat("points.ply", "points", "points.ply"),
     ExportFormat("colmap", "cameras", "sparse/0", index="images.bin", more_files=(
-        "sparse/*", "images/*", "colmap/*")),  # colmap/: before version 5
+        "sparse/*", "images/*", "database.db", "colmap/*")),  # colmap/: before version 5
     ExportFormat("transforms.json", "cameras", "transforms.json", more_files=(
-        "sparse_pc.ply", "images/*")),
+        "sparse_pc.ply", "images/*", "depth/*")),
     ExportFormat("mesh.ply", "mesh", "mesh.ply", options=_MESH_OPTIONS),
     ExportFormat("mesh.glb", "mesh", "mesh.glb", options=_MESH_OPTIONS),
     ExportFormat("mesh.obj", "mesh", "mesh.obj", options=_MESH_OPTIONS),
     ExportFormat(PLAN, "plan", PLAN, more_files=("measures.json",), options=_MESH_OPTIONS),
 )}
+
+# Other names in --format, by the program that reads the files.
+OTHER_NAMES = {"nerfstudio": "transforms.json"}
 
 # Formats that are read, but not written.
 READ_ONLY: dict[str, ExportFormat] = {row.name: row for row in (

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from recon_cli.capture.foreign import FOREIGN, find_foreign, find_lists, recognise_file
+from recon_cli.datasets.layouts import LAYOUTS
 
 METASHAPE = ('<?xml version="1.0"?><document version="2.0.0"><chunk><cameras>'
              '<camera id="0" label="a"/></cameras></chunk></document>')
@@ -66,10 +67,21 @@ def test_files_without_text_are_recognised_too(tmp_path):
 
 
 def test_the_command_that_converts_it_names_its_file(tmp_path):
-    put(tmp_path / "cameras.xml", METASHAPE)
+    put(tmp_path / "sfm_data.json", '{"views": [], "extrinsics": []}')
     (found,) = find_foreign(tmp_path)
-    assert (f"ns-process-data metashape --data {tmp_path} --xml {tmp_path / 'cameras.xml'} "
-            "--output-dir SCENE") in found.notice(tmp_path)
+    assert (f"openMVG_main_openMVG2Colmap -i {tmp_path / 'sfm_data.json'} -o SCENE"
+            ) in found.notice(tmp_path)
+
+
+def test_what_is_read_as_a_data_set_names_the_folder_to_give(tmp_path):
+    put(tmp_path / "odometry.csv", FILES["odometry.csv"][0])
+    (found,) = find_foreign(tmp_path)
+    assert f"recon ingest {tmp_path} uses them" in found.notice(tmp_path / "rgb.mp4")
+    assert "files that belong to it are missing" in found.notice(tmp_path)
+
+
+def test_every_layout_that_a_row_names_is_read():
+    assert {row.layout for row in FOREIGN} - {""} <= {row.name for row in LAYOUTS}
 
 
 @pytest.mark.parametrize(("name", "text"), [

@@ -133,8 +133,10 @@ def test_of_an_app_the_best_photos_are_taken_and_its_poses_are_named(tmp_path):
     files, notices = found(tmp_path)
     assert files == ["keyframes/corrected_images/1.jpg"]
     assert "keyframes/corrected_cameras/ is the raw data of Polycam" in notices
+    assert "files that belong to it are missing" in notices
     assert "poses and depth are not read" in notices
-    assert "ns-process-data polycam" in notices
+    inside = found(tmp_path / "keyframes" / "images")[1]
+    assert f"recon ingest {tmp_path / 'keyframes'} uses them" in inside
 
 
 def test_poses_above_a_folder_called_images_are_named_too(tmp_path):
@@ -157,7 +159,8 @@ def test_depth_and_poses_that_a_data_set_does_not_use_are_named(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", np.zeros(3))
     (tmp_path / "bundle.out").write_text("# Bundle file v0.3\n")
     used = {tmp_path / "images" / "a.png", tmp_path / "depth" / "a.png"}
-    assert describe_unused(tmp_path, used, "a COLMAP model") == [
+    assert describe_unused(tmp_path, used, "colmap", "a COLMAP model") == [
         "confidence/ holds 1 confidence maps, by its name, and is not used.",
         "bundle.out is cameras in Bundler's format and is not used: the folder is read as a "
         "COLMAP model."]
+    assert len(describe_unused(tmp_path, used, "bundler", "that")) == 1

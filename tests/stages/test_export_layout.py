@@ -71,6 +71,25 @@ def test_the_reader_of_gsplat_pairs_each_camera_with_its_image(out):
     assert all(np.isfinite(point.xyz).all() for point in model.points3D.values())
 
 
+def test_colmap_reads_places_and_gravity_as_priors(out):
+    viewmats = {name: viewmat
+                for name, _, viewmat in read_images(out / "sparse" / "0" / "images.bin")}
+    with pycolmap.Database.open(str(out / "database.db")) as database:
+        images = {image.image_id: image.name for image in database.read_all_images()}
+        assert set(images.values()) == viewmats.keys()
+        assert database.num_frames() == len(images)
+        priors = database.read_all_pose_priors()
+    assert {images[prior.corr_data_id.id] for prior in priors} == viewmats.keys()
+    for prior in priors:
+        viewmat = viewmats[images[prior.corr_data_id.id]]
+        np.testing.assert_allclose(
+            prior.position, -viewmat[:3, :3].T @ viewmat[:3, 3], atol=1e-9)
+        assert prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.CARTESIAN
+        if prior.has_gravity():  # down; the export has y up
+            np.testing.assert_allclose(
+                viewmat[:3, :3].T @ np.ravel(prior.gravity), [0, -1, 0], atol=1e-9)
+
+
 def test_the_reader_of_nerfstudio_starts_from_the_points_of_the_same_world(out):
     meta = json.loads((out / "transforms.json").read_text())
     cloud = trimesh.load(out / meta["ply_file_path"])

@@ -198,9 +198,9 @@ def test_images_of_twelve_bits_are_brightened_and_said(tmp_path, notices):
     assert stored.max() > 200
 
 
-def test_depth_by_the_key_of_another_program_is_named(tmp_path, notices):
+def test_depth_of_an_unknown_unit_is_not_read_and_said_so(tmp_path, notices):
     value = transforms()
     for frame in value["frames"]:
         frame["depth_path"] = "images/0.depth.png"
     take(make_transforms(tmp_path / "set", value), tmp_path / "out")
-    assert any("4 frames name their depth by depth_path" in notice for notice in notices())
+    assert any("depth of 4 frames is not read: its unit" in notice for notice in notices())

@@ -229,9 +229,10 @@ def test_poses_beside_the_video_of_an_app_are_named(tmp_path, notices):
     (tmp_path / "stray").mkdir()
     video = write_video(tmp_path / "stray" / "rgb.mp4", walk(20))
     (tmp_path / "stray" / "odometry.csv").write_text("timestamp, frame, x, y, z, qx, qy, qz, qw\n")
-    with pytest.raises(InputError, match="holds no photos") as caught:
+    with pytest.raises(InputError, match="has no frame with a pose") as caught:
         take(tmp_path / "stray", tmp_path / "none")
     assert f"recon ingest {video}" in caught.value.hint
     found = len(notices())
     take(video, tmp_path / "out")
-    assert "a recording of Stray Scanner: its poses and depth are not read" in notices()[found]
+    assert "a recording of Stray Scanner: its poses and depth are not used" in notices()[found]
+    assert f"recon ingest {tmp_path / 'stray'} uses them" in notices()[found]

@@ -1,0 +1,175 @@
+"""What readers of photogrammetry exports share: photos by name, points beside them, far worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.datasets.app_frames import LeftOut
+from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
+from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, find_images
+from recon_cli.errors import FormatError, InputError
+from recon_cli.scene.camera import Lens, make_lens
+
+_PICTURES = frozenset(suffix.lower() for suffix in SUFFIXES)
+# Beyond this many units from the origin, map coordinates: float32 would round to centimetres.
+_FAR = 1e4
+_MOST_OFF = 0.25  # pixels by which a lens without r^8 may miss one that has it
+_FITS = 3.0  # points of the same world lie within so many times the extent of the cameras
+
+
+def list_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Returns the pictures below a folder by names that may be paths elsewhere, or lack a suffix.
+
+    A name that fits several files, or a file that fits several names, is left out, unless their
+    folders tell them apart.
+    """
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PICTURES
+                   and path.is_file() and path.name[0] != ".")
+    keys: dict[str, list[Path]] = {}
+    for path in files:
+        for key in {path.name.casefold(), f"/{path.stem.casefold()}"}:
+            keys.setdefault(key, []).append(path)
+    found = {}
+    for name in names:
+        parts = PureWindowsPath(name).parts
+        last = parts[-1] if parts else ""
+        stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
+        fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
+        if len(fitting) > 1:
+            shared = [_shared(path.parts, parts) for path in fitting]
+            best = max(shared)
+            fitting = [path for path, count in zip(fitting, shared, strict=True) if count == best]
+        if len(fitting) == 1:
+            found[name] = fitting[0]
+    taken = list(found.values())
+    return {name: path for name, path in found.items() if taken.count(path) == 1}
+
+
+def _shared(path: Sequence[str], other: Sequence[str]) -> int:
+    """Returns how many folders two paths share at their ends."""
+    count = 0
+    for one, two in zip(reversed(path[:-1]), reversed(other[:-1]), strict=False):
+        if one.casefold() != two.casefold():
+            break
+        count += 1
+    return count
+
+
+def solved_set(
+    layout: str, listed: Sequence[PosedImage], folder: Path, left_out: LeftOut, *, photos: str,
+    missing: Sequence[str] = (),
+) -> PosedSet:
+    """Returns the images of an export, in the unit of its world; InputError if there are none."""
+    if not listed:
+        told = "; ".join(left_out.notices())
+        what = told or (f"{len(missing)} photos that it lists are not there, the first is "
+                        f"{missing[0]}" if missing else "it lists none")
+        raise InputError(
+            f"{folder} has no photo with a pose: {what}.",
+            hint="Put the photos beside the file of the cameras; or give them alone, so that the "
+            f"cameras are found from them: recon ingest {photos}")
+    unique = _unique_names(listed, folder)
+    posed = find_images(layout, unique, folder, missing=missing)
+    return replace(posed, notices=(*left_out.notices(), *posed.notices))
+
+
+def _unique_names(listed: Sequence[PosedImage], folder: Path) -> list[PosedImage]:
+    """Returns the images by their file names, or by their paths where some are called alike."""
+    if len({image.name for image in listed}) == len(listed):
+        return list(listed)
+    return [replace(image, name=image.path.relative_to(folder).as_posix()) for image in listed]
+
+
+def shift_far(posed: PosedSet) -> PosedSet:
+    """Returns the set with its world moved to its cameras, if it lies as far off as on a map."""
+    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
+    middle = np.round(np.median(centers, axis=0))
+    if np.abs(middle).max() < _FAR:
+        return posed
+    images = []
+    for image in posed.images:
+        viewmat = image.viewmat.copy()
+        viewmat[:3, 3] += viewmat[:3, :3] @ middle
+        images.append(replace(image, viewmat=viewmat))
+    text = " ".join(f"{value:.0f}" for value in middle)
+    return replace(
+        posed, images=tuple(images), points=None if posed.points is None else posed.points - middle,
+        notices=(*posed.notices, f"its world lies far from the origin, as on a map: {text} was "
+                 "subtracted from all positions"))
+
+
+def find_points(posed: PosedSet, folder: Path) -> PosedSet:
+    """Returns the set with the points of the one .ply beside it, if it has one that fits."""
+    files = sorted(path for path in folder.glob("*.ply") if path.is_file())
+    if posed.points is not None or not files:
+        return posed
+    name = files[0].name
+    if len(files) > 1:
+        return _with_notice(posed, f"its {len(files)} .ply files are not read: one may be given")
+    # Late, for it imports torch, which nothing else here needs.
+    from recon_cli.splats.ply import read_ply_points
+
+    try:
+        points, colors = read_ply_points(files[0])
+    except (FormatError, InputError) as error:
+        return _with_notice(posed, f"{name} is not read: {error.message}")
+    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
+    middle = np.median(points, axis=0) if len(points) else np.full(3, np.inf)
+    extent = max(float(np.ptp(centers, axis=0).max()), float(np.ptp(np.percentile(
+        points, (5, 95), axis=0), axis=0).max()) if len(points) else 0.0)
+    if not np.linalg.norm(middle - np.median(centers, axis=0)) <= _FITS * extent:
+        return _with_notice(posed, f"{name} is not read: its points lie far from the cameras")
+    if colors is None:
+        colors = np.full(points.shape, 128, np.uint8)
+    rows = thin_points(points, MAX_POINTS)
+    return replace(posed, points=points[rows], colors=colors[rows])
+
+
+def _with_notice(posed: PosedSet, text: str) -> PosedSet:
+    return replace(posed, notices=(*posed.notices, text))
+
+
+def radial_lens(
+    size: tuple[int, int], inner: Sequence[float], radial: Sequence[float],
+    tangential: tuple[float, float], where: str,
+) -> Lens:
+    """Returns a lens of fx fy cx cy, k1 to k4 of r^2 to r^8, and OpenCV's p1 and p2.
+
+    COLMAP's models have no r^8: with k4, the others are those that come nearest over the picture.
+    FormatError if they miss it.
+    """
+    if radial[3]:
+        radial = (*_without_last(size, inner, np.array(radial), where), 0.0)
+    k1, k2, k3, _ = map(float, radial)
+    if not any((k1, k2, k3, *tangential)):
+        return make_lens("PINHOLE", *size, inner, where)
+    if not k3:
+        return make_lens("OPENCV", *size, (*inner, k1, k2, *tangential), where)
+    return make_lens(
+        "FULL_OPENCV", *size, (*inner, k1, k2, *tangential, k3, 0.0, 0.0, 0.0), where)
+
+
+def _without_last(
+    size: tuple[int, int], inner: Sequence[float], radial: NDArray[np.float64], where: str
+) -> NDArray[np.float64]:
+    """Returns k1 to k3 that move points as k1 to k4 do, to a fraction of a pixel."""
+    width, height = size
+    fx, fy, cx, cy = inner
+    corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
+    r = np.linspace(0, corner, 200)
+    powers = r[:, None]**np.array([3, 5, 7, 9]) * fx  # pixels along the radius
+    wanted = powers @ radial
+    if not np.isfinite(wanted).all():
+        raise FormatError(f"{where} has coefficients of distortion that are not finite.")
+    found = np.linalg.lstsq(powers[:, :3], wanted, rcond=None)[0]
+    off = float(np.abs(powers[:, :3] @ found - wanted).max())
+    if off > _MOST_OFF:
+        raise FormatError(
+            f"{where} has k4 = {radial[3]:g}, a term of r^8 that moves points by up to {off:.1f} "
+            "pixels, and cannot be used.", hint="Export undistorted images, or fit without k4.")
+    return np.asarray(found)

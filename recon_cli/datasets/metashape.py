@@ -1,0 +1,217 @@
+"""Agisoft Metashape: photos with the cameras of "Export Cameras" (XML).
+
+A camera's transform is camera to chunk, row by row, OpenCV's axes; that of its component takes the
+chunk to the world: scale * R * x + t. Calibrations count cx and cy from the middle of the image,
+b1 is the difference of the focal lengths, b2 a skew, p1 and p2 are OpenCV's p2 and p1, and k4 is a
+term of r^8. Of two calibrations the adjusted one is used. (Metashape's manual, appendix C;
+nerfstudio's issue 2294.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.datasets.app_frames import Z_UP, LeftOut, quoted
+from recon_cli.datasets.exported_files import (
+    find_points,
+    list_files,
+    radial_lens,
+    shift_far,
+    solved_set,
+)
+from recon_cli.datasets.posed import PosedImage, PosedSet
+from recon_cli.errors import FormatError
+from recon_cli.scene.camera import Lens, make_lens
+from recon_cli.scene.similarity import Similarity
+from recon_cli.workspace.atomic import read_text
+
+_HINT = "Export the cameras again from Metashape: File > Export > Export Cameras, as .xml."
+_MARKS = (b"<document", b"<chunk", b"<camera")
+_HEAD = 1 << 16  # bytes; sensors come before cameras
+_SKEW = 0.5  # pixels that leaving out b2 may move the border
+# On the earth's surface, from its centre: coordinates whose up is not z.
+_ECEF = (6.3e6, 6.4e6)  # metres
+
+
+def is_metashape(path: Path) -> bool:
+    """Returns whether a folder has such an .xml, or a file is one."""
+    return _find(path) is not None
+
+
+def _find(path: Path) -> Path | None:
+    for file in [path] if path.is_file() else sorted(path.glob("*.xml")):
+        if file.suffix.lower() == ".xml" and file.is_file():
+            with file.open("rb") as stream:
+                head = stream.read(_HEAD)
+            if all(mark in head for mark in _MARKS[:2]) and (
+                    b"<sensor" in head or _MARKS[2] in head):
+                return file
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    label: str
+    sensor: str
+    component: str | None
+    transform: str | None
+    where: str
+
+
+def read_metashape(path: Path) -> PosedSet:
+    """Returns the photos that are aligned; InputError if none is, FormatError if damaged."""
+    file = _find(path)
+    assert file is not None
+    chunk, folder = _read_chunk(file), file.parent
+    cameras = [
+        _Camera(node.get("label", ""), node.get("sensor_id", ""), node.get("component_id"),
+                node.findtext("transform"), f"{file}, camera {node.get('label')}")
+        for node in chunk.iterfind("cameras//camera")]
+    worlds = {node.get("id"): _component(node, file)
+              for node in chunk.iterfind("components/component")}
+    sensors = {node.get("id", ""): node for node in chunk.iterfind("sensors/sensor")}
+    left_out, listed, missing = LeftOut(), [], []
+    files = list_files(folder, [camera.label for camera in cameras])
+    for camera in cameras:
+        image = files.get(camera.label)
+        if camera.transform is None:
+            left_out.add(camera.label, "without a transform: not aligned, or second of a rig")
+        elif image is None:
+            missing.append(camera.label)
+        elif (viewmat := left_out.pose(
+                camera.label, _pose, camera, worlds, opengl=False)) is not None:
+            lens = _sensor_lens(sensors.get(camera.sensor), camera, left_out)
+            if lens is not None:
+                listed.append(PosedImage(image.name, image, lens, viewmat))
+    scaled = any(world.scale != 1 for world in worlds.values())
+    posed = solved_set("metashape", listed, folder, left_out, missing=missing,
+                       photos=quoted(folder))
+    return _finish(posed, folder, scaled)
+
+
+def _finish(posed: PosedSet, folder: Path, scaled: bool) -> PosedSet:
+    """Returns the set with its unit, up and points."""
+    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
+    middle = np.median(centers, axis=0)
+    radius = float(np.linalg.norm(middle))
+    posed = shift_far(find_points(posed, folder))
+    if not scaled:  # in the chunk's own units
+        return replace(posed, find_up=True)
+    if _ECEF[0] < radius < _ECEF[1]:
+        x, y, z = middle / radius
+        return replace(posed, metric=True, up=(float(x), float(y), float(z)))
+    return replace(posed, metric=True, up=Z_UP)
+
+
+def _read_chunk(file: Path) -> ElementTree.Element:
+    try:
+        text = read_text(file)
+        if "<!ENTITY" in text or "<!DOCTYPE" in text:  # neither has a place in such a file
+            raise ValueError("it defines entities")
+        chunk = ElementTree.fromstring(text).find("chunk")
+    except (OSError, ValueError, ElementTree.ParseError) as error:
+        raise FormatError(f"{file} cannot be read as XML: {error}.", hint=_HINT) from error
+    if chunk is None:
+        raise FormatError(f"{file} holds no chunk.", hint=_HINT)
+    return chunk
+
+
+def _numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
+    try:
+        values = np.array((text or "").split(), np.float64)
+    except ValueError as error:
+        raise FormatError(f"{where} holds something other than numbers.", hint=_HINT) from error
+    if values.size != count or not np.isfinite(values).all():
+        raise FormatError(f"{where} has {values.size} numbers, needed {count}.", hint=_HINT)
+    return values
+
+
+def _component(node: ElementTree.Element, file: Path) -> Similarity:
+    """Returns what takes the chunk to the world."""
+    found = node.find("transform")
+    if found is None:
+        return Similarity()
+    where = f"{file}, the transform of component {node.get('id')},"
+    rotation, shift, scale = (found.findtext(key) for key in ("rotation", "translation", "scale"))
+    matrix = np.eye(3) if rotation is None else _numbers(rotation, 9, where).reshape(3, 3)
+    left, _, right = np.linalg.svd(matrix)
+    if np.abs(left @ right - matrix).max() > 1e-3:
+        raise FormatError(f"{where} holds no rotation.", hint=_HINT)
+    try:
+        return Similarity(
+            1.0 if scale is None else float(_numbers(scale, 1, where)[0]), left @ right,
+            np.zeros(3) if shift is None else _numbers(shift, 3, where))
+    except ValueError as error:
+        raise FormatError(f"{where} cannot be used: {error}.", hint=_HINT) from error
+
+
+def _pose(camera: _Camera, worlds: Mapping[str | None, Similarity]) -> NDArray[np.float64]:
+    """Returns camera to world [4, 4]."""
+    inner = _numbers(camera.transform, 16, camera.where).reshape(4, 4)
+    world = worlds.get(camera.component) or (
+        next(iter(worlds.values())) if len(worlds) == 1 else Similarity())
+    pose = np.eye(4)
+    pose[:3, :3] = world.rotation @ inner[:3, :3]
+    pose[:3, 3] = world.points(inner[:3, 3])
+    return pose
+
+
+def _sensor_lens(
+    sensor: ElementTree.Element | None, camera: _Camera, left_out: LeftOut
+) -> Lens | None:
+    """Returns the lens of a sensor, None where COLMAP has none like it."""
+    if sensor is None:
+        left_out.add(camera.label, "of a sensor that the file lacks")
+        return None
+    kind = sensor.get("type", "frame")
+    if kind not in ("frame", "fisheye", "equidistant_fisheye"):
+        left_out.add(camera.label, f"of a {kind} sensor, which is not read")
+        return None
+    try:
+        return _make_lens(sensor, kind, camera.where)
+    except FormatError as error:
+        left_out.add(camera.label, f"whose intrinsics cannot be used ({error.message})")
+        return None
+
+
+def _make_lens(sensor: ElementTree.Element, kind: str, where: str) -> Lens:
+    calibrations = sensor.findall("calibration")
+    chosen = next((one for one in calibrations if one.get("class") == "adjusted"),
+                  calibrations[-1] if calibrations else None)
+    size = chosen.find("resolution") if chosen is not None else None
+    size = sensor.find("resolution") if size is None else size
+    if chosen is None or size is None:
+        raise FormatError(f"{where} has no calibration.")
+
+    def number(key: str) -> float:
+        text = chosen.findtext(key)
+        return 0.0 if text is None else float(_numbers(text, 1, f"{where} {key}")[0])
+
+    try:
+        width, height = int(size.get("width", "")), int(size.get("height", ""))
+    except ValueError as error:
+        raise FormatError(f"{where} has no resolution.") from error
+    focal = number("f")
+    if abs(number("b2")) * height / max(focal, 1e-9) / 2 > _SKEW:
+        raise FormatError(f"{where} has the skew b2 = {number('b2'):g}")
+    inner = (focal + number("b1"), focal, width / 2 + number("cx"), height / 2 + number("cy"))
+    radial = [number(f"k{at}") for at in range(1, 5)]
+    if kind == "frame":
+        return radial_lens((width, height), inner, radial, (number("p2"), number("p1")), where)
+    return _fisheye((width, height), inner, radial, (number("p1"), number("p2")), where)
+
+
+def _fisheye(
+    size: tuple[int, int], inner: Sequence[float], radial: Sequence[float],
+    tangential: tuple[float, float], where: str,
+) -> Lens:
+    """Returns the lens of an equidistant fisheye: radial terms of the angle, as in OpenCV."""
+    if any(tangential):
+        raise FormatError(f"{where} is a fisheye with p1 or p2")
+    return make_lens("OPENCV_FISHEYE", *size, (*inner, *radial), where)

@@ -1,0 +1,149 @@
+"""Meta Quest 3: colour and poses of QuestRealityCapture's MRUK recordings.
+
+session_info.json names the backend. {left,right}_camera_mruk_rgba/<us>.rgba hold R G B A, bottom
+row first; _intrinsics.json the lens, and _frame_metadata.csv a pose for each file in Unity's axes
+(left-handed, y up, metres, camera to world). Rows whose pose, texture or colours failed are left
+out. (t-34400/QuestRealityCapture: MrukCameraRecorder.cs.) The rows of its depth are not documented,
+so depth is not read.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.datasets.app_frames import (
+    LeftOut,
+    numbers,
+    pose_from_quat,
+    quoted,
+    read_csv,
+    tracked_set,
+)
+from recon_cli.datasets.posed import PosedImage, PosedSet, is_file, resolve_inside
+from recon_cli.errors import FormatError, InputError
+from recon_cli.scene.camera import Lens, make_lens
+from recon_cli.workspace.atomic import read_json
+
+_EYES = ("left", "right")
+_OK = ("pose_ok", "get_texture_ok", "get_colors_ok")
+_POSITION, _TURN = "pose_pos_{}", "pose_rot_{}"
+_UNITY_WORLD, _UNITY_CAMERA = np.diag([1.0, 1, -1, 1]), np.diag([1.0, -1, 1, 1])
+_HINT = "Copy the recording from the headset again."
+
+
+def is_quest(folder: Path) -> bool:
+    """Returns whether a folder is a recording of the MRUK backend."""
+    return any((folder / f"{eye}_camera_mruk_rgba").is_dir()
+               and (folder / f"{eye}_camera_mruk_frame_metadata.csv").is_file() for eye in _EYES)
+
+
+def read_quest(folder: Path) -> PosedSet:
+    """Returns the frames of both cameras; InputError if none has an image and a pose."""
+    left_out, listed = LeftOut(), list[PosedImage]()
+    for eye in _EYES:
+        if (folder / f"{eye}_camera_mruk_frame_metadata.csv").is_file():
+            listed += _list_eye(folder, eye, left_out)
+    # Both cameras of a moment after each other, so that neighbours by name are so in time.
+    listed.sort(key=lambda image: (image.path.stem, image.name))
+    posed = tracked_set(
+        "quest", listed, folder, left_out,
+        photos=f"{quoted(folder)}, once its .rgba files are converted to pictures")
+    depth = any(next((folder / f"{eye}_depth").glob("*.raw"), None) for eye in _EYES
+                if (folder / f"{eye}_depth").is_dir())
+    return replace(posed, notices=(*posed.notices, *(
+        ["its depth is not read: the order of its rows is not documented"] * depth)))
+
+
+def _list_eye(folder: Path, eye: str, left_out: LeftOut) -> list[PosedImage]:
+    """Returns the frames of one camera."""
+    home = folder / f"{eye}_camera_mruk_rgba"
+    table = folder / f"{eye}_camera_mruk_frame_metadata.csv"
+    columns = [_POSITION.format(axis) for axis in "xyz"], [_TURN.format(axis) for axis in "xyzw"]
+    rows = read_csv(table, ["file_name", *columns[0], *columns[1]])
+    lens = _read_lens(folder / f"{eye}_camera_mruk_intrinsics.json")
+    listed = []
+    for row in rows:
+        label = f"{eye} {row.get('file_name', '?')}"
+        if any(row.get(key, "true").lower() in ("false", "0") for key in _OK):
+            left_out.add(label, "that the headset says failed")
+            continue
+        path = _find_file(home, row.get("file_name", ""), table)
+        if path is None:
+            left_out.add(label, "whose .rgba file is missing")
+            continue
+        own = _own_lens(lens, row)
+        if path.stat().st_size != own.width * own.height * 4:
+            left_out.add(label, f"whose .rgba file does not hold {own.width}x{own.height} pixels")
+            continue
+        viewmat = left_out.pose(label, _pose, row, columns, opengl=False)
+        if viewmat is not None:
+            listed.append(PosedImage(
+                f"{path.stem}_{eye}.rgba", path, own, viewmat, time=_time(row),
+                read=functools.partial(read_rgba, path, own.width, own.height)))
+    return listed
+
+
+def _find_file(home: Path, name: str, table: Path) -> Path | None:
+    """Returns the file of a row, with or without its suffix."""
+    try:
+        path = resolve_inside(home, Path(name).name, str(table))
+    except FormatError:
+        return None
+    named = path if path.suffix == ".rgba" else path.with_name(f"{path.name}.rgba")
+    return named if is_file(named) else None
+
+
+def _pose(row: Mapping[str, str], columns: tuple[list[str], list[str]]) -> NDArray[np.float64]:
+    """Returns camera to world, OpenCV's camera axes, in a right-handed world with y up."""
+    unity = pose_from_quat(numbers(row, columns[1]), numbers(row, columns[0]))
+    return _UNITY_WORLD @ unity @ _UNITY_CAMERA
+
+
+def _read_lens(path: Path) -> Lens:
+    value: Mapping[str, Any] = read_json(path, dict, hint=_HINT)
+    try:
+        focal, center, size = value["focalLength"], value["principalPoint"], value["resolution"]
+        params = [float(pair[axis]) for pair in (focal, center) for axis in "xy"]
+        return make_lens("PINHOLE", float(size["width"]), float(size["height"]), params, str(path))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"{path} lacks focalLength, principalPoint or resolution.", hint=_HINT) from error
+
+
+def _own_lens(lens: Lens, row: Mapping[str, str]) -> Lens:
+    """Returns the lens at the size of a row's picture; FormatError if it has another shape."""
+    try:
+        width, height = int(row["width"]), int(row["height"])
+    except (KeyError, ValueError):
+        return lens
+    if min(width, height) < 1 or abs(width * lens.height - height * lens.width) > max(
+            width, height, lens.width, lens.height):
+        raise FormatError(
+            f"The intrinsics are for {lens.width}x{lens.height} pixels, but pictures have "
+            f"{width}x{height}.", hint=_HINT)
+    return lens.resized(width, height)
+
+
+def _time(row: Mapping[str, str]) -> float | None:
+    try:
+        return float(row["timestamp_us_realtime"]) / 1e6
+    except (KeyError, ValueError):
+        return None
+
+
+def read_rgba(path: Path, width: int, height: int) -> NDArray[np.uint8]:
+    """Returns RGB [H, W, 3] of a file of R G B A, bottom row first; InputError if damaged."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error}.", hint=_HINT) from error
+    if data.size != width * height * 4:
+        raise InputError(f"{path} does not hold {width}x{height} pixels.", hint=_HINT)
+    return np.ascontiguousarray(data.reshape(height, width, 4)[::-1, :, :3])

@@ -1,0 +1,132 @@
+"""Record3D: the export "EXR + RGB", and .r3d, unpacked.
+
+rgb/<i>.jpg with depth/<i>.exr and metadata.json (often in a folder EXR_RGBD), or rgbd/<i>.jpg with
+<i>.depth and <i>.conf, packed by LZFSE, and a file `metadata`. The number in a name is the place in
+the lists of the metadata, and files may be missing. Poses are camera to world, ARKit's axes of the
+image as it is stored, as qx qy qz qw tx ty tz in metres. The world is often that of the first
+camera, so up is not known. K counts column by column and is that of the first frame; each frame may
+have its own. (marek-simonik/record3d, issues 27, 33, 53, 59, 86, 95.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.datasets.app_frames import (
+    LeftOut,
+    list_numbered,
+    pose_from_quat,
+    quoted,
+    tracked_set,
+)
+from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.posed import PosedImage, PosedSet
+from recon_cli.errors import FormatError
+from recon_cli.scene.camera import Lens
+from recon_cli.workspace.atomic import read_json
+
+_HINT = "Export the recording again from Record3D."
+_JPEG = (".jpg", ".jpeg")
+
+
+def is_record3d(folder: Path) -> bool:
+    """Returns whether a folder is an export of Record3D."""
+    return _find(folder) is not None
+
+
+def _find(folder: Path) -> tuple[Path, Path, str] | None:
+    """Returns the folder, its metadata and the name of the folder of its images."""
+    for place in (folder, folder / "EXR_RGBD"):
+        for name, images in (("metadata", "rgbd"), ("metadata.json", "rgb")):
+            if (place / name).is_file() and (place / images).is_dir():
+                return place, place / name, images
+    return None
+
+
+def read_record3d(folder: Path) -> PosedSet:
+    """Returns the frames whose image is there.
+
+    InputError if none has a pose; FormatError if the metadata are damaged or lack poses or K.
+    """
+    found = _find(folder)
+    assert found is not None
+    place, metadata, name = found
+    value = read_json(metadata, dict, hint=_HINT, finite=False)
+    size = _whole(value, "w", metadata), _whole(value, "h", metadata)
+    poses = _list(value, "poses", metadata)
+    own = value.get("perFrameIntrinsicCoeffs") or []
+    times = value.get("frameTimestamps") or []
+    left_out, listed = LeftOut(), []
+    images = list_numbered(place / name, _JPEG)
+    for number, path in images.items():
+        if number >= len(poses):
+            left_out.add(path.name, "beyond the list of poses")
+            continue
+        viewmat = left_out.pose(path.name, _pose, poses[number], opengl=True)
+        if viewmat is None:
+            continue
+        lens = left_out.lens(path.name, size, _intrinsics, value, own, number, metadata)
+        if lens is None:
+            continue
+        listed.append(PosedImage(
+            path.name, path, lens, viewmat, depth=_depth(place, path, lens, value),
+            time=_time(times, number)))
+    posed = tracked_set(
+        "record3d", listed, folder, left_out, up=None, photos=quoted(place / name))
+    return posed
+
+
+def _pose(row: Sequence[Any]) -> NDArray[np.float64]:
+    """Returns camera to world of qx qy qz qw tx ty tz."""
+    return pose_from_quat(row[:4], row[4:7])
+
+
+def _intrinsics(
+    value: dict[str, Any], own: Sequence[Any], number: int, metadata: Path
+) -> Sequence[float]:
+    """Returns fx, fy, cx, cy of a frame, for w x h."""
+    if number < len(own):
+        fx, fy, cx, cy = own[number][:4]
+        return fx, fy, cx, cy
+    k = _list(value, "K", metadata)  # old files have this alone
+    if len(k) != 9:
+        raise FormatError(f"{metadata} has {len(k)} numbers as K, needed 9.", hint=_HINT)
+    return k[0], k[4], k[6], k[7]
+
+
+def _depth(place: Path, path: Path, lens: Lens, value: dict[str, Any]) -> DepthFile | None:
+    """Returns the depth of an image, None where its file is missing."""
+    exr, packed = place / "depth" / f"{path.stem}.exr", path.with_suffix(".depth")
+    if exr.is_file():
+        return DepthFile(exr, 1.0, lens, reliable=LIDAR_RANGE)
+    if not packed.is_file():
+        return None
+    shape = (_whole(value, "dh", place), _whole(value, "dw", place))
+    levels = path.with_suffix(".conf")
+    return DepthFile(
+        packed, 1.0, lens, reliable=LIDAR_RANGE, shape=shape,
+        confidence=ConfidenceFile(levels) if levels.is_file() else None)
+
+
+def _whole(value: dict[str, Any], key: str, where: Path) -> int:
+    number = value.get(key)
+    if not isinstance(number, (int, float)) or not 1 <= number <= 1 << 16:
+        raise FormatError(f"{where} has {key} = {number!r:.40}; needed are pixels.", hint=_HINT)
+    return int(number)
+
+
+def _list(value: dict[str, Any], key: str, where: Path) -> list[Any]:
+    found = value.get(key)
+    if not isinstance(found, list) or not found:
+        raise FormatError(f"{where} has no list of {key}.", hint=_HINT)
+    return found
+
+
+def _time(times: Sequence[Any], number: int) -> float | None:
+    found = times[number] if number < len(times) else None
+    return float(found) if isinstance(found, (int, float)) else None

@@ -1,0 +1,221 @@
+"""RTAB-Map, as `rtabmap-export --images --poses_camera` writes it.
+
+NAME_rgb/<stamp>.jpg (stereo: NAME_left), NAME_depth/<stamp>.png in millimetres,
+NAME_calib/<stamp>.yaml (OpenCV's), NAME_camera_poses.txt: `#timestamp x y z qx qy qz qw id`, or
+without the id. Poses are camera to world, OpenCV's axes, z up, metres, optimised. With --images_id
+files are called by the id. Several cameras have _0, _1 at the ends of names. Without it,
+NAME_poses.txt holds the robot's base: the camera is base * local_transform of its yaml.
+(introlab/rtabmap: tools/Export/main.cpp, Graph.cpp, CameraModel.cpp.)
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.datasets.app_frames import (
+    MILLIMETRE,
+    PICTURES,
+    Z_UP,
+    LeftOut,
+    pose_from_quat,
+    quoted,
+    tracked_set,
+)
+from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
+from recon_cli.datasets.posed import PosedImage, PosedSet
+from recon_cli.errors import FormatError
+from recon_cli.scene.camera import Lens, make_lens
+from recon_cli.workspace.atomic import read_text
+
+_POSES = re.compile(r"(.+)_camera_poses(?:_(\d+))?\.txt")
+_BASE = re.compile(r"(.+)_poses\.txt")
+_NUMBERS = r"\s*:\s*\[([^\]]*)\]"
+_HINT = "Export again: rtabmap-export --images --poses_camera --poses_format 11 NAME.db"
+_NEAR = 1e-4  # seconds; stamps are written with 6 decimals
+_PLUMB_BOB = (4, 5)  # k1 k2 p1 p2 (k3)
+_RATIONAL = 8  # and k4 k5 k6
+
+
+def is_rtabmap(folder: Path) -> bool:
+    """Returns whether a folder is an export of RTAB-Map with poses."""
+    return bool(_find(folder))
+
+
+def _find(folder: Path) -> list[tuple[str, str, Path, bool]]:
+    """Returns name, suffix of the camera, file of poses, and whether these are the base's."""
+    found = []
+    files = sorted(folder.glob("*_poses*.txt")) if folder.is_dir() else []
+    for path in files:
+        match = _POSES.fullmatch(path.name)
+        if match and _pictures(folder, match[1]):
+            found.append((match[1], f"_{match[2]}" if match[2] else "", path, False))
+    if not found:
+        for path in files:
+            match = _BASE.fullmatch(path.name)
+            if match and _pictures(folder, match[1]) and (folder / f"{match[1]}_calib").is_dir():
+                found.append((match[1], "", path, True))
+    return found
+
+
+def _pictures(folder: Path, name: str) -> Path | None:
+    return next((place for kind in ("rgb", "left")
+                 if (place := folder / f"{name}_{kind}").is_dir()), None)
+
+
+def read_rtabmap(folder: Path) -> PosedSet:
+    """Returns the images with a pose and a calibration.
+
+    InputError if there is none; FormatError if the poses have no time stamps or are damaged.
+    """
+    found = _find(folder)
+    left_out, listed = LeftOut(), list[PosedImage]()
+    for name, camera, path, base in found[:1] if found[0][3] else found:
+        listed += _list_camera(folder, name, camera, path, base, left_out)
+    posed = tracked_set(
+        "rtabmap", listed, folder, left_out, up=Z_UP,
+        photos=quoted(_pictures(folder, found[0][0]) or folder))
+    return replace(posed, accuracy="solved")
+
+
+def _list_camera(
+    folder: Path, name: str, camera: str, path: Path, base: bool, left_out: LeftOut
+) -> list[PosedImage]:
+    """Returns the images of one camera."""
+    place = _pictures(folder, name)
+    assert place is not None
+    by_time, by_id = _read_poses(path)
+    several = camera or next(place.glob("*_0.*"), None)
+    listed = []
+    for image in sorted(place.iterdir(), key=lambda one: _order(one.stem)):
+        if image.suffix.lower() not in PICTURES:
+            continue
+        stem = image.stem
+        if several:
+            stem, _, number = stem.rpartition("_")
+            if f"_{number}" != (camera or "_0"):
+                continue
+        pose = _look_up(stem, by_time, by_id)
+        if pose is None:
+            left_out.add(image.name, f"without a pose in {path.name}")
+            continue
+        calibration = folder / f"{name}_calib" / f"{image.stem}.yaml"
+        try:
+            lens, local = _read_calibration(calibration)
+        except FormatError:
+            left_out.add(image.name, "without a calibration that can be read")
+            continue
+        viewmat = left_out.pose(
+            image.name, np.matmul, pose, local if base else np.eye(4), opengl=False)
+        if viewmat is None:
+            continue
+        depth = folder / f"{name}_depth" / f"{image.stem}.png"
+        listed.append(PosedImage(
+            image.name, image, lens, viewmat, time=float(stem) if "." in stem else None,
+            depth=DepthFile(depth, MILLIMETRE, lens, reliable=LIDAR_RANGE)
+            if depth.is_file() else None))
+    return listed
+
+
+def _order(stem: str) -> tuple[float, str]:
+    number = stem.split("_")[0]
+    return (float(number) if number.replace(".", "", 1).isdecimal() else 0.0), stem
+
+
+Poses = list[tuple[float, NDArray[np.float64]]]
+
+
+def _read_poses(path: Path) -> tuple[Poses, dict[int, NDArray[np.float64]]]:
+    """Returns camera to world by time, in its order, and by id; landmarks are left out."""
+    try:
+        lines = read_text(path).splitlines()
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path} cannot be read: {error}.", hint=_HINT) from error
+    by_time: Poses = []
+    by_id = {}
+    rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    for at, row in enumerate(rows):
+        if len(row) not in (8, 9):
+            if at == len(rows) - 1 and at:  # cut short
+                continue
+            raise FormatError(
+                f"{path} has {len(row)} words in a line; needed are 8 or 9: the time, x y z, "
+                "qx qy qz qw, and the id.", hint=_HINT)
+        values = [_float(word) for word in row]
+        if len(row) == 9 and values[8] < 0:  # a landmark
+            continue
+        try:
+            pose = pose_from_quat(values[4:8], values[1:4])
+        except ValueError:
+            pose = np.full((4, 4), np.nan)
+        by_time.append((values[0], pose))
+        if len(row) == 9 and np.isfinite(values[8]):
+            by_id[int(values[8])] = pose
+    return sorted(by_time, key=lambda one: one[0]), by_id
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+def _look_up(
+    stem: str, by_time: Poses, by_id: dict[int, NDArray[np.float64]]
+) -> NDArray[np.float64] | None:
+    """Returns the pose of a file, by its time, else by its id."""
+    if stem.isdecimal() and int(stem) in by_id:
+        return by_id[int(stem)]
+    time = _float(stem)
+    near = min(by_time, key=lambda one: abs(one[0] - time), default=None)
+    return near[1] if near is not None and abs(near[0] - time) <= _NEAR else None
+
+
+def _read_calibration(path: Path) -> tuple[Lens, NDArray[np.float64]]:
+    """Returns the lens and local_transform of OpenCV's YAML; FormatError if it is none."""
+    try:
+        text = read_text(path)
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path} cannot be read: {error}.") from error
+    sizes = [re.search(rf"^image_{side}\s*:\s*(\d+)", text, re.MULTILINE)
+             for side in ("width", "height")]
+    matrix = _data(text, "camera_matrix")
+    if sizes[0] is None or sizes[1] is None or len(matrix) != 9:
+        raise FormatError(f"{path} lacks image_width, image_height or camera_matrix.")
+    width, height = int(sizes[0][1]), int(sizes[1][1])
+    inner = matrix[0], matrix[4], matrix[2], matrix[5]
+    lens = make_lens("PINHOLE", width, height, inner, str(path))
+    local = _data(text, "local_transform")
+    transform = np.eye(4)
+    if len(local) == 12:
+        transform[:3] = np.reshape(local, (3, 4))
+    distortion = _data(text, "distortion_coefficients")
+    if not any(distortion):
+        return lens, transform
+    if "equidistant" in text and len(distortion) >= 4:
+        return make_lens("OPENCV_FISHEYE", width, height, (*inner, *_fisheye(distortion)),
+                         str(path)), transform
+    if len(distortion) not in (*_PLUMB_BOB, _RATIONAL):
+        raise FormatError(f"{path} has {len(distortion)} coefficients of distortion.")
+    padded = (*distortion, *[0.0] * (8 - len(distortion)))
+    return make_lens("FULL_OPENCV", width, height, (*inner, *padded), str(path)), transform
+
+
+def _fisheye(distortion: list[float]) -> list[float]:
+    """Returns k1 to k4; with 6 numbers they are k1 k2 0 0 k3 k4 (CameraModel.cpp)."""
+    return distortion[:2] + distortion[4:6] if len(distortion) == 6 else distortion[:4]
+
+
+def _data(text: str, key: str) -> list[float]:
+    """Returns the numbers of a matrix in OpenCV's YAML; empty where there is none."""
+    block = re.search(rf"^{key}\s*:(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+    found = re.search(rf"data{_NUMBERS}", block[1]) if block else None
+    try:
+        return [float(one) for one in found[1].split(",")] if found else []
+    except ValueError:
+        return []

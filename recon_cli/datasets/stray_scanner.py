@@ -1,0 +1,137 @@
+"""Stray Scanner: rgb.mp4 with odometry.csv, camera_matrix.csv, depth/ and confidence/.
+
+Frame n of the video belongs to the row and to the files of depth that are numbered n, whatever the
+times say. Poses are camera to world with OpenCV's axes, in ARKit's world: metres, y up. Since April
+2026 each row has its own intrinsics; camera_matrix.csv holds those of the last frame. Depth and
+confidence are PNGs, in millimetres and as 0, 1, 2. (strayrobots/scanner, docs/format.md, issues 11
+and 17.) The units of imu.csv differ between versions, so it is not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.capture.video import open_video, read_declared_length
+from recon_cli.datasets.app_frames import (
+    MILLIMETRE,
+    LeftOut,
+    fit_intrinsics,
+    list_numbered,
+    numbers,
+    pose_from_quat,
+    quoted,
+    read_csv,
+    tracked_set,
+)
+from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.posed import PosedImage, PosedSet
+from recon_cli.errors import FormatError, InputError
+
+_VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_INNER = ("fx", "fy", "cx", "cy")
+
+
+def is_stray(folder: Path) -> bool:
+    """Returns whether a folder is a recording of Stray Scanner."""
+    return (folder / _VIDEO).is_file() and (folder / _ODOMETRY).is_file()
+
+
+def read_stray(folder: Path) -> PosedSet:
+    """Returns the frames of the video that have a row.
+
+    InputError if none has a pose; FormatError if the video or a list is damaged.
+    """
+    video, odometry = folder / _VIDEO, folder / _ODOMETRY
+    rows = read_csv(odometry, ("frame", *_POSE))
+    size, count = _measure(video)
+    inner, notices = _read_matrix(folder / _MATRIX, size, rows)
+    depths = list_numbered(folder / "depth", (".png",))
+    levels = list_numbered(folder / "confidence", (".png",))
+    left_out, listed, seen = LeftOut(), [], set[int]()
+    for row in rows:
+        name = f"frame {row.get('frame', '?')}"
+        if not row.get("frame", "").isdecimal() or int(row["frame"]) in seen:
+            left_out.add(name, "whose number is missing or repeated")
+            continue
+        number = int(row["frame"])
+        seen.add(number)
+        if count and number >= count:
+            left_out.add(name, f"beyond the {count} of the video")
+            continue
+        viewmat = left_out.pose(name, _pose, row, opengl=False)
+        if viewmat is None:
+            continue
+        lens = left_out.lens(name, size, _intrinsics, row, inner, size)
+        if lens is None:
+            continue
+        confidence = ConfidenceFile(levels[number]) if number in levels else None
+        depth = DepthFile(depths[number], MILLIMETRE, lens, confidence=confidence,
+                          reliable=LIDAR_RANGE) if number in depths else None
+        listed.append(PosedImage(
+            f"{number:06d}.png", video, lens, viewmat, depth=depth, frame=number,
+            time=_time(row)))
+    posed = tracked_set(
+        "stray", sorted(listed, key=lambda image: image.name), folder, left_out,
+        photos=quoted(video))
+    return replace(posed, notices=(*posed.notices, *notices))
+
+
+def _measure(video: Path) -> tuple[tuple[int, int], int]:
+    """Returns width and height as stored, and the number of frames, 0 if it is not known."""
+    try:
+        with open_video(video) as (_, stream):
+            size = stream.codec_context.width, stream.codec_context.height
+        return size, read_declared_length(video).frames
+    except InputError as error:
+        raise FormatError(error.message, hint="Copy the recording again.") from error
+
+
+def _read_matrix(
+    path: Path, size: tuple[int, int], rows: Sequence[Mapping[str, str]]
+) -> tuple[Sequence[float] | None, list[str]]:
+    """Returns fx, fy, cx, cy for frames without their own, and notices."""
+    if not path.is_file():
+        if any(not row.get("fx") for row in rows):
+            raise FormatError(
+                f"{path} is missing, and {_ODOMETRY} has no intrinsics of each frame.",
+                hint="Copy the recording again.")
+        return None, []
+    text = path.read_text(encoding="utf-8", errors="replace").replace(",", " ").split()
+    try:
+        fx, _, cx, _, fy, cy, _, _, one = (float(number) for number in text)
+        if one != 1:
+            raise ValueError("another matrix")
+    except ValueError as error:
+        raise FormatError(f"{path} does not hold the 9 numbers of a matrix of intrinsics.",
+                          hint="Copy the recording again.") from error
+    inner, factor = fit_intrinsics((fx, fy, cx, cy), size, str(path))
+    return inner, [f"its intrinsics were scaled by {factor:.4g}: those of {path.name} are for "
+                   "images of another size"] * (factor != 1)
+
+
+def _pose(row: Mapping[str, str]) -> NDArray[np.float64]:
+    return pose_from_quat(numbers(row, _POSE[3:]), numbers(row, _POSE[:3]))
+
+
+def _intrinsics(
+    row: Mapping[str, str], inner: Sequence[float] | None, size: tuple[int, int]
+) -> Sequence[float]:
+    """Returns fx, fy, cx, cy of a frame: its own, else those of the last one."""
+    if all(row.get(key) for key in _INNER):
+        return fit_intrinsics(numbers(row, _INNER), size, _ODOMETRY)[0]
+    if inner is None:
+        raise KeyError("no intrinsics")
+    return inner
+
+
+def _time(row: Mapping[str, str]) -> float | None:
+    try:
+        return float(row["timestamp"])
+    except (KeyError, ValueError):
+        return None
