@@ -27,9 +27,12 @@ _MEDIAN_LENGTH = 1.538
 
 
 def make_points(
-    model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache, seed: int
+    model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache, seed: int,
+    max_error: float = MAX_ERROR_PX,
 ) -> None:
     """Gives a model of placed cameras the points that its matches show, in place of those it has.
+
+    A point may be `max_error` pixels off its observations.
 
     Points made anew with better cameras drop what worse ones had joined: of two rooms with drifted
     cameras the worst one came out 1.0 cm off where points were kept, .4 cm where not.
@@ -40,6 +43,8 @@ def make_points(
     mapping, triangulation = options.mapper, options.triangulation
     mapping.num_threads = THREADS
     mapping.random_seed = triangulation.random_seed = seed
+    mapping.filter_max_reproj_error = max_error
+    triangulation.merge_max_reproj_error = triangulation.complete_max_reproj_error = max_error
     worker = pycolmap.IncrementalMapper(cache)
     worker.begin_reconstruction(model)
     for number in sorted(model.reg_image_ids()):
@@ -52,9 +57,10 @@ def make_points(
 
 def adjust_with_priors(
     model: pycolmap.Reconstruction, priors: Centers, deviation: float, *,
-    constant: Collection[int] = (), seed: int,
+    constant: Collection[int] = (), seed: int, max_error: float = MAX_ERROR_PX,
 ) -> None:
-    """Adjusts a model in place, each camera held near its prior; drops points that got lost.
+    """Adjusts a model in place, each camera held near its prior; drops points that got lost, which
+    are more than `max_error` pixels off.
 
     `deviation` is the standard deviation of a prior, in the model's units; priors that are far off
     count little, by Cauchy's loss. Errors of points count likewise, see `limits.LOSS_SCALE`. The
@@ -89,7 +95,7 @@ def adjust_with_priors(
                 coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN))
     pycolmap.create_pose_prior_bundle_adjuster(
         options, prior_options, config, held, model).solve()
-    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_RAY_ANGLE_DEG)
+    pycolmap.ObservationManager(model).filter_all_points3D(max_error, MIN_RAY_ANGLE_DEG)
     model.update_point_3d_errors()
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.io.depth_maps import read_depth, read_depth_list
+from recon_cli.io.depth_maps import DepthMap, read_depth, read_depth_list
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.sfm.job import MappingJob, StepLog
 from recon_cli.sfm.results import ModelResult
@@ -49,6 +49,11 @@ class DeviceEvidence:
     axes_open: bool = True  # up is to be found; else the axes stay
     up: tuple[float, float, float] | None = None  # in the model, where it is known
     sources: tuple[ScaleSource, ...] = ()
+
+    @property
+    def depth_scale(self) -> float | None:
+        """Metres of a unit of the model by its depth, which may differ from those by all."""
+        return next((source.scale for source in self.sources if source.name == DEPTH), None)
 
 
 def ask_device(
@@ -178,19 +183,12 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
     ratios = []
     for name in (names[int((at + 0.5) * len(names) / count)] for at in range(count)):
         one = maps[name]
-        depth, levels = read_depth(ingest, name, one)
-        if levels is not None:
-            depth[levels < SURE] = 0
-        if one.reliable is not None:
-            depth[depth > one.reliable] = 0
+        depth = read_sure_depth(ingest, name, one)
         pixels, ours = _seen_depths(model, images[name])
         if not len(pixels):
             continue
         rays = np.asarray(images[name].camera.cam_from_img(pixels))
-        map_camera = pycolmap.Camera(
-            model=one.lens.model, width=one.lens.width, height=one.lens.height,
-            params=one.lens.params)
-        at = np.asarray(map_camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+        at = np.asarray(lens_camera(one).img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
         at = np.nan_to_num(at, nan=-1.0)
         inside = ((at >= 0) & (at < (one.lens.width, one.lens.height))).all(axis=1)
         column, row = at[inside].astype(np.intp).T
@@ -205,6 +203,23 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
     # of a median: 1.25 times that of a mean
     error = 1.25 * spread / np.sqrt(len(ratios))
     return ScaleSource(DEPTH, scale, float(np.hypot(error, DEPTH_ERROR)))
+
+
+def read_sure_depth(ingest: Path, name: str, one: DepthMap) -> NDArray[np.float32]:
+    """Returns the depth [h, w] of a frame in world units, 0 where it is not sure or too far."""
+    depth, levels = read_depth(ingest, name, one)
+    if levels is not None:
+        depth[levels < SURE] = 0
+    if one.reliable is not None:
+        depth[depth > one.reliable] = 0
+    return depth
+
+
+def lens_camera(one: DepthMap) -> pycolmap.Camera:
+    """Returns the camera of a depth map."""
+    lens = one.lens
+    return pycolmap.Camera(
+        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
 
 
 def _seen_depths(

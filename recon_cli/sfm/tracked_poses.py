@@ -9,6 +9,7 @@ with the frames before and after it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -19,9 +20,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from recon_cli.errors import format_count
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import mapper, matching
-from recon_cli.sfm.evidence import gather_evidence
+from recon_cli.sfm.evidence import explained_matches
 from recon_cli.sfm.job import MappingJob, Reporter
-from recon_cli.sfm.limits import MIN_POSE_INLIERS, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
+from recon_cli.sfm.limits import (
+    MAX_ERROR_PX,
+    MIN_POSE_INLIERS,
+    MIN_SPOT_AGREEING,
+    MIN_SPOT_MATCHES,
+)
 from recon_cli.sfm.loop_closure import bend_model
 from recon_cli.sfm.matching import Pair
 from recon_cli.sfm.merge_models import build_posed_model
@@ -34,7 +40,10 @@ Viewmats = Mapping[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 # name at these distances.
 STEPS = (1, 2)
 SIMILAR = 2  # pairs per image that look alike, besides those that overlap: they may close a loop
-ROUNDS = 2  # adjustments, each to points made anew
+# Degrees that rays to a point may be off in each adjustment, to points made anew: the tracking
+# drifts by a degree, which is 5 pixels in a small picture and 25 in a large one. At least
+# `limits.MAX_ERROR_PX`.
+ROUNDS_DEG = (1.5, 0.0)
 # Standard deviation of a tracked position before it is measured, and the least one, as shares of
 # the size of the path.
 FIRST_DEVIATION, LEAST_DEVIATION = 0.02, 0.001
@@ -71,21 +80,35 @@ def near_pairs(names: Collection[str]) -> set[Pair]:
 
 
 def match_near(job: MappingJob, viewmats: Viewmats, report: Reporter) -> PosesCheck:
-    """Matches frames that follow each other, and returns how well the poses fit them."""
-    matching.match_pairs(job, near_pairs(job.names), report)
-    evidence = gather_evidence(_posed(job, viewmats), job.database, job.names)
-    placed = evidence.placed
-    pairs = evidence.pairs[placed]
-    matches, agreeing = evidence.matches[placed], evidence.agreeing[placed]
-    own = np.zeros((2, len(evidence.names)), np.int64)  # of each frame: matches, agreeing
-    for side in (0, 1):
-        np.add.at(own[0], pairs[:, side], matches)
-        np.add.at(own[1], pairs[:, side], agreeing)
-    total = int(matches.sum())
-    share = float(agreeing.sum() / total) if total >= MIN_SPOT_MATCHES else None
-    wrong = (own[0] >= MIN_SPOT_MATCHES) & (own[1] < MIN_SPOT_AGREEING * own[0])
+    """Matches frames that follow each other, and returns how well the poses fit them.
+
+    Between others the poses may have drifted.
+    """
+    near = near_pairs(job.names)
+    matching.match_pairs(job, near, report)
+    model = _posed(job, viewmats)
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    offset = _widest(model, ROUNDS_DEG[0])
+    with pycolmap.Database.open(job.database) as opened:
+        keypoints = {
+            name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+            for name, image in images.items()}
+    matches, agreeing = Counter[str](), Counter[str]()
+    for pair, geometry in matching.read_verified(job.database).items():
+        if pair not in near or not set(pair) <= images.keys():
+            continue
+        ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
+                        for side, name in enumerate(pair))
+        count = int(np.count_nonzero(explained_matches(
+            images[pair[0]], ours, images[pair[1]], theirs, 0.0, offset)))
+        for name in pair:
+            matches[name] += len(ours)
+            agreeing[name] += count
+    total = matches.total() // 2
+    share = agreeing.total() / matches.total() if total >= MIN_SPOT_MATCHES else None
     return PosesCheck(total, share, tuple(
-        name for name, bad in zip(evidence.names, wrong, strict=True) if bad))
+        name for name in sorted(matches) if matches[name] >= MIN_SPOT_MATCHES
+        and agreeing[name] < MIN_SPOT_AGREEING * matches[name]))
 
 
 def match_overlapping(
@@ -116,17 +139,19 @@ def adjust_tracked(
     priors = {name: _center(viewmat) for name, viewmat in viewmats.items()}
     size = float(np.linalg.norm(np.ptp(np.array(list(priors.values())), axis=0))) or 1.0
     deviation, before = FIRST_DEVIATION * size, 0.0
-    for number in range(ROUNDS):
+    for number, angle in enumerate(ROUNDS_DEG):
+        off = _widest(model, angle)
         if number:
             bent = bend_model(model, matching.read_verified(job.database), seed=job.seed)
             model = bent or model
             _place(model, _follow(model, viewmats))
-        make_points(model, cache, job.seed)
+        make_points(model, cache, job.seed, off)
         if not number:
             before = model.compute_mean_reprojection_error()
         take_out(model, {name for name, count in _points(model).items()
                           if count < MIN_POSE_INLIERS})
-        adjust_with_priors(model, priors, deviation, constant=constant, seed=job.seed)
+        adjust_with_priors(
+            model, priors, deviation, constant=constant, seed=job.seed, max_error=off)
         deviation = max(measure_deviation(model, priors), LEAST_DEVIATION * size)
         if set(job.names) - set(viewmats):
             mapper.resect(job, model)
@@ -158,6 +183,12 @@ def describe_tracked(found: TrackedModel, parts: int) -> tuple[str, ...]:
             f"{format_count(len(found.replaced), 'frame')} had no pose, or one that the "
             "pictures contradict: matches place them.")
     return tuple(sentences)
+
+
+def _widest(model: pycolmap.Reconstruction, degrees: float) -> float:
+    """Returns the pixels of an angle in the cameras of a model, at least MAX_ERROR_PX."""
+    focal = float(np.median([camera.mean_focal_length() for camera in model.cameras.values()]))
+    return max(MAX_ERROR_PX, focal * float(np.tan(np.radians(degrees))))
 
 
 def _posed(job: MappingJob, viewmats: Viewmats) -> pycolmap.Reconstruction:

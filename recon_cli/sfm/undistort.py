@@ -22,6 +22,7 @@ from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.sfm.align_world import world_transform
+from recon_cli.sfm.depth_points import add_depth_points
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
 from recon_cli.sfm.results import PlacedResult, UndistortedResult
@@ -49,6 +50,8 @@ def place_model(job: MappingJob) -> PlacedResult:
     viewmats = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
                 for name, image in images.items()}
     device = ask_device(job, model, viewmats)
+    if device.depth_scale is not None and job.pose_use != "keep" and job.poses is not None:
+        add_depth_points(model, job.poses.parent, job.frames, device.depth_scale)
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,
         gravity=job.gravity and device.axes_open, given_up=device.up,

@@ -42,9 +42,11 @@ def truth(shared_data):
 @pytest.fixture
 def given(room):
     """Writes poses, and points, into ingest; they are gone after the test."""
-    def write(viewmats, points=None):
+    def write(viewmats, points=None, *, tracked=False):
         colors = None if points is None else np.full((len(points), 3), 128, np.uint8)
-        KnownPoses(viewmats, True, points, colors).write(room / "ingest")
+        KnownPoses(
+            viewmats, True, points, colors, up=(0.0, 0.0, 1.0) if tracked else None,
+            accuracy="tracked" if tracked else "solved").write(room / "ingest")
 
     yield write
     for path in (room / "ingest").glob("po*s.*"):
@@ -218,3 +220,25 @@ def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(t
     middle = mask.shape[1] // 2
     assert not mask[:, :middle - 1].any()
     assert mask[:, middle + 1:].all()
+
+
+@pytest.mark.integration
+def test_tracked_poses_are_refined_and_give_metres_and_up(room, truth, given, tmp_path):
+    noise = np.random.default_rng(0)
+    given({name: shaken(viewmat, noise) for name, viewmat in truth.items()}, tracked=True)
+    summary = run(room, tmp_path / "out")
+    assert summary.poses.use == "auto"
+    assert summary.poses.held == 0
+    assert summary.world.evidence.metres
+    assert summary.world.evidence.axis == "data set"
+    np.testing.assert_allclose(steps(found(tmp_path / "out")), steps(truth), rtol=0.05)
+
+
+@pytest.mark.integration
+def test_tracked_poses_of_another_capture_are_not_used(room, truth, given, tmp_path):
+    given({name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()},
+          tracked=True)
+    summary = run(room, tmp_path / "out", min_registered=0.3)
+    assert summary.poses.use == "refuted"
+    assert not summary.world.evidence.metres
+    assert any("from the pictures alone" in line for line in summary.lines)

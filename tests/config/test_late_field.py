@@ -11,10 +11,10 @@ class Config(StageConfig):
     """A stage whose second field is newer than its results."""
 
     old: int = option(1, "Old.")
-    new: str = option("auto", "New.", choices=("auto", "other"), added=True)
+    new: str = option("auto", "New.", choices=("auto", "other"), late=True)
 
 
-def test_an_added_field_is_hashed_only_where_it_is_not_its_default():
+def test_a_late_field_is_hashed_only_where_it_is_not_its_default():
     assert Config().hashed_fields() == {"old": 1}
     assert Config(new="other").hashed_fields() == {"old": 1, "new": "other"}
 
