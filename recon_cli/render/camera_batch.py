@@ -467,7 +467,7 @@ class _Logit(torch.autograd.Function):
     def forward(ctx: Any, opacities: Tensor) -> Tensor:
         high = 1 - torch.finfo(opacities.dtype).eps / 2  # the greatest number below 1
         held = opacities.clamp(_OPACITY_MIN, high)
-        ctx.save_for_backward(held)
+        ctx.save_for_backward(held.nan_to_num(0.5))  # a NaN is not drawn, and gets a zero
         return held.log() - (-held).log1p()
 
     @staticmethod

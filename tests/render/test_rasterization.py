@@ -16,6 +16,7 @@ from interpreter import DEVICE
 
 from recon_cli import rasterization
 from recon_cli.errors import BackendError, ConfigError, InputError
+from recon_cli.kernels.thread_pool import pool
 from recon_cli.render.camera_batch import radii
 
 # the interpreter of triton takes its tensors for those of a CPU, which `rasterization` refuses
@@ -313,6 +314,27 @@ def test_a_scene_without_gaussians_shows_the_background() -> None:
         torch.testing.assert_close(images, expected)
         assert not alphas.any()
         assert len(meta["radii"]) == 0
+
+
+@pytest.mark.parametrize("name", ["means", "scales", "opacities", "colors"])
+def test_a_value_that_is_not_finite_hides_its_gaussian_alone(name: str) -> None:
+    inputs = {k: v.float() for k, v in scene().items()}
+    without = {k: torch.cat([v[:6], v[7:]]) if k in NAMES[:5] else v for k, v in inputs.items()}
+    inputs[name][6] = torch.nan
+    leaves = {k: v.requires_grad_() for k, v in inputs.items()}
+    images, _, meta = call(**leaves)
+    torch.testing.assert_close(images.detach(), call(**without)[0])
+    assert 6 not in meta["gaussian_ids"]
+    images.sum().backward()
+    assert all(torch.isfinite(leaf.grad).all() for leaf in leaves.values())
+
+
+def test_numbers_of_threads_stay_as_they_were() -> None:
+    torch.set_num_threads(2)  # the fixture `one_thread` restores it
+    before = pool.threads
+    call(means=scene()["means"].float().requires_grad_(), backend="numba")[0].sum().backward()
+    assert torch.get_num_threads() == 2
+    assert pool.threads == before
 
 
 def test_arguments_that_change_nothing_are_accepted() -> None:
