@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from recon_cli.api.rendering import Rendering as Rendering
     from recon_cli.api.rendering import measure_contributions as measure_contributions
     from recon_cli.api.rendering import render as render
+    from recon_cli.api.rendering import render_depth as render_depth
     from recon_cli.api.results import EvaluateResult as EvaluateResult
     from recon_cli.api.results import ExportResult as ExportResult
     from recon_cli.api.results import IngestResult as IngestResult
@@ -72,7 +73,8 @@ _PUBLIC: dict[str, tuple[str, ...]] = {
     "recon_cli.api.splats": ("Splats",),
     "recon_cli.scene.camera": ("Camera",),
     "recon_cli.api.cameras": ("make_camera", "look_at", "read_cameras"),
-    "recon_cli.api.rendering": ("render", "Rendering", "measure_contributions", "Contributions"),
+    "recon_cli.api.rendering": (
+        "render", "Rendering", "render_depth", "measure_contributions", "Contributions"),
     "recon_cli.api.scoring": ("evaluate", "Scores"),
     "recon_cli.evaluation.scores": ("ViewScore", "ModelMetrics"),
     "recon_cli.api.workspace": ("Workspace",),

@@ -18,6 +18,7 @@ from recon_cli.io.images import to_uint8
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import NullProgress
 from recon_cli.render import registry
+from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -30,7 +31,9 @@ class Rendering:
 
     rgb: NDArray[np.float32]  # [H, W, 3] over the background; 0 to 1, but not clamped
     alpha: NDArray[np.float32]  # [H, W] coverage, 0 to 1
-    depth: NDArray[np.float32]  # [H, W] expected z-depth in world units; 0 where alpha is 0
+    # [H, W] expected z-depth in world units, 0 where alpha is 0. The mean of all that lies along a
+    # ray: what shines through from far behind pulls it back; `render_depth` is that of the surface
+    depth: NDArray[np.float32]
 
     @property
     def image(self) -> NDArray[np.uint8]:
@@ -82,6 +85,20 @@ def render(
             np.array(tensor.cpu().numpy(), np.float32)
             for tensor in (output.rgb, output.alpha, expected))
         return Rendering(rgb, alpha, depth)
+
+
+def render_depth(
+    splats: Splats, camera: Camera, *, backend: str = "auto", device: str = "auto",
+    threads: int | None = None,
+) -> NDArray[np.float32]:
+    """Returns the z-depth of the surface in a view, [H, W] in world units; 0 where there is none.
+
+    It is where the Gaussian at which half of the light is stopped is densest along the ray of a
+    pixel, as for meshes and measures. Arguments and errors are those of `render`.
+    """
+    with computing(backend, device, threads) as ctx:
+        depth = render_surface(_placed(splats, ctx), camera, backend=ctx.backend).depth
+        return np.array(depth.cpu().numpy(), np.float32)
 
 
 def measure_contributions(

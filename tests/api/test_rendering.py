@@ -16,7 +16,15 @@ from one_gaussian_scene import (
     one_gaussian,
 )
 
-from recon_cli.api import BackendError, ConfigError, InputError, measure_contributions, render
+from recon_cli.api import (
+    BackendError,
+    ConfigError,
+    InputError,
+    Splats,
+    measure_contributions,
+    render,
+    render_depth,
+)
 
 BACKENDS = ["torch", "numba"]
 MIDDLE = SIDE // 2
@@ -43,6 +51,20 @@ def test_one_gaussian_looks_as_its_formula_says(backend: str) -> None:
     assert (output.rgb.dtype, output.depth.dtype) == (np.float32, np.float32)
     assert output.image[MIDDLE, MIDDLE].tolist() == [
         round(255 * OPACITY * channel) for channel in RED[0]]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_surface_stays_where_it_is_though_something_shines_through(backend: str) -> None:
+    wall = one_gaussian(scales=[[2.0, 2, 0.01]], opacities=[0.9])
+    both = Splats.from_arrays(
+        [[0.0, 0, 0], [0, 0, 90]], [[1.0, 0, 0, 0]] * 2, [[2.0, 2, 0.01], [50, 50, 1]],
+        [0.9, 0.9], RED * 2)
+    for splats in (wall, both):
+        depth = render_depth(splats, facing_camera(), backend=backend, device="cpu")
+        assert depth[MIDDLE, MIDDLE] == pytest.approx(DISTANCE, rel=1e-3)
+    expected = render(both, facing_camera(), backend=backend, device="cpu").depth
+    # 0.9 of it at 4 units, 0.09 at 94
+    assert expected[MIDDLE, MIDDLE] == pytest.approx((0.9 * 4 + 0.09 * 94) / 0.99, rel=1e-3)
 
 
 def test_the_background_shows_through() -> None:
