@@ -138,7 +138,7 @@ def _notices(kept: KeptFiles, failed: Mapping[str, FailedFormat]) -> tuple[str, 
     return (
         *(f"{file.file} is stale: {file.stale}. It is kept; --format {name} writes it again."
           for name, file in kept.files.items() if file.stale),
-        *(f"there is no {EXPORT_FORMATS[name].file}: {one.message} {one.hint}"
+        *(f"{EXPORT_FORMATS[name].file} was not written: {one.message} {one.hint}"
           for name, one in failed.items() if one.skipped_with is not None),
         *(f"{old} was not written by recon, or changed since: it is kept as {new}."
           for old, new in kept.renamed.items()))
