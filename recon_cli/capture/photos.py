@@ -19,6 +19,7 @@ from recon_cli.errors import InputError, list_names
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 _COLOURED = frozenset({"RGB", "RGBA", "RGBX", "P", "PA", "CMYK", "YCbCr", "LAB", "HSV"})
 _DEPTH = "depth maps"
+_NEVER = (_DEPTH, "confidence maps")  # of one channel and with such a name, they are never photos
 _NAMED = 4
 # Focal lengths that agree this well are one setting of the lens: EXIF rounds to a tenth of a mm.
 SAME_FOCAL = 0.01
@@ -91,6 +92,9 @@ def _drop_depth_and_masks(
     for kind in sorted(set(kinds.values()) - {""}):
         names = [photo.name for photo in photos if kinds[photo] == kind]
         if coloured < max(MIN_FRAMES, len(names) / 2):  # gray photos, and a few others
+            names = [photo.name for photo in photos if kinds[photo] == kind and kind in _NEVER
+                     and picture_kind(photo.path.stem) == kind]
+        if not names:
             continue
         dropped.update(names)
         notices.append(

@@ -41,11 +41,12 @@ _inputs = click.argument("inputs", metavar="[INPUT]...", nargs=-1, type=options.
 @options.stage(IngestConfig)
 @pass_call
 def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
-    """Choose frames from videos, photos or a data set with poses.
+    """Choose frames from videos, photos or a capture with poses.
 
-    INPUT: videos, photos, folders of photos, or a data set with poses (COLMAP, transforms.json,
-    Replica, ScanNet, 7-Scenes, TUM RGB-D), recognised by its layout. Each video and each folder
-    gets its own intrinsics. Without INPUT, the previous input is used.
+    INPUT: videos, photos, folders of photos, or a capture with poses, recognised by its layout: of
+    a scanning app (Polycam, Record3D, Stray Scanner and others), of photogrammetry (COLMAP,
+    Metashape, RealityScan and others) or a data set. Each video and each folder gets its own
+    intrinsics. Without INPUT, the previous input is used.
     """
     run_stages(call, "ingest", ["ingest"], sources=inputs)
 

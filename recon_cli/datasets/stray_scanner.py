@@ -34,6 +34,7 @@ from recon_cli.errors import FormatError, InputError
 
 _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_SPARE_ROWS, _SPARE_SHARE = 3, 0.02  # by which rows and frames of a whole recording differ
 _INNER = ("fx", "fy", "cx", "cy")
 
 
@@ -79,6 +80,9 @@ def read_stray(folder: Path) -> PosedSet:
     posed = tracked_set(
         "stray", sorted(listed, key=lambda image: image.name), folder, left_out,
         photos=quoted(video))
+    if count and abs(count - len(rows)) > max(_SPARE_ROWS, _SPARE_SHARE * count):
+        notices.append(f"the video has {count} frames, but {_ODOMETRY} {len(rows)} rows: one of "
+                       "them is cut short, or of another recording")
     return replace(posed, notices=(*posed.notices, *notices))
 
 

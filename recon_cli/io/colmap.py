@@ -273,8 +273,8 @@ def write_priors(
                 database.write_rig(rig, use_rig_id=True)
             for number, (_, camera) in enumerate(views, start=1):
                 image = model.image(number)
-                database.write_image(image, use_image_id=True)
                 database.write_frame(model.frame(image.frame_id), use_frame_id=True)
+                database.write_image(image, use_image_id=True)
                 database.write_pose_prior(_prior(image.data_id, camera, deviation, up))
         partial.replace(path)
     finally:

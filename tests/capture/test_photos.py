@@ -217,3 +217,17 @@ def test_every_photo_is_in_one_group_and_names_differ(kinds):
     assert sorted(str(p.path) for g in groups for p in g.photos) == sorted(
         str(p.path) for p in photos)
     assert len({group.name for group in groups}) == len(groups)
+
+
+def test_depth_beside_few_photos_is_not_taken_for_photos(tmp_path):
+    # an app saves depth for every frame, and a photo for some
+    for number in range(12):
+        depth = np.full((30, 40), 900 + number, np.uint16)
+        Image.fromarray(depth).save(tmp_path / f"depth_{number:05d}.png")
+        Image.fromarray(np.full((30, 40), 2, np.uint8)).save(tmp_path / f"conf_{number:05d}.png")
+    for number in range(4):
+        Image.new("RGB", (80, 60), (number, 90, 60)).save(tmp_path / f"frame_{number:05d}.jpg")
+    found = list_photos(sorted(tmp_path.iterdir())).photos
+    rest, notices = drop_other_pictures(tmp_path, found)
+    assert {photo.name for photo in rest} == {f"frame_{number:05d}.jpg" for number in range(4)}
+    assert len(notices) == 2

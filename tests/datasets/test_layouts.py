@@ -2,6 +2,7 @@ import json
 
 import posed_sets
 import pytest
+from app_sets import APPS
 
 from recon_cli.datasets.layouts import LAYOUTS, describe, read_posed, recognise, refuse_incomplete
 from recon_cli.errors import FormatError, InputError
@@ -30,7 +31,8 @@ MAKERS = {
 
 
 def test_every_layout_is_tried():
-    assert {layout.name for layout in LAYOUTS} == MAKERS.keys()
+    apps = {app.name for app in APPS.values()}  # tests/datasets/test_apps.py
+    assert {layout.name for layout in LAYOUTS} == MAKERS.keys() | apps
 
 
 @pytest.mark.parametrize("name", MAKERS)

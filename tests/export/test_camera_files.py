@@ -1,10 +1,13 @@
 """Depth and priors beside the cameras of an export."""
 
+from dataclasses import replace
+
 import numpy as np
+import pycolmap
 import pytest
 
 from recon_cli.export.camera_files import _as_seen
-from recon_cli.io.colmap import project
+from recon_cli.io.colmap import project, write_priors
 from recon_cli.io.depth_maps import write_depth
 from recon_cli.scene.camera import Camera, Lens
 
@@ -55,3 +58,23 @@ def test_a_distorted_lens_is_followed():
     (at,) = project(lens, np.array([[0.3, 0.1, 1.0]]))
     scale = 1 + k1 * (0.3**2 + 0.1**2)
     assert at == pytest.approx([90 * 0.3 * scale + 50, 90 * 0.1 * scale + 40])
+
+
+def test_priors_hold_places_their_deviation_and_gravity(tmp_path):
+    turned = np.eye(4)
+    turned[:3] = [[1, 0, 0, 2.0], [0, 0, -1, 1.0], [0, 1, 0, 0.5]]  # looks along y, z is up
+    views = [("a.png", view(40, 30, 35.0)), ("b.png", replace(view(40, 32, 35.0), viewmat=turned))]
+    write_priors(tmp_path / "database.db", views, deviation=0.1, up=np.array([0.0, 0, 1]))
+    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
+        first, second = database.read_all_pose_priors()
+        assert [image.name for image in database.read_all_images()] == ["a.png", "b.png"]
+        assert database.num_cameras() == 2
+    np.testing.assert_allclose(np.ravel(second.position), views[1][1].center)
+    np.testing.assert_allclose(second.position_covariance, 0.01 * np.eye(3))
+    np.testing.assert_allclose(np.ravel(second.gravity), [0, 1, 0], atol=1e-12)  # down the picture
+    np.testing.assert_allclose(np.ravel(first.gravity), [0, 0, -1], atol=1e-12)
+    write_priors(tmp_path / "database.db", views, deviation=None, up=None)  # again
+    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
+        first, _ = database.read_all_pose_priors()
+    assert not first.has_position_cov()
+    assert not first.has_gravity()

@@ -83,7 +83,8 @@ def test_depth_is_stored_at_the_size_of_the_sensor(name, frames, tmp_path):
             lens.params[0] / lens.width, rel=1e-9)
         shot = min(frames, key=lambda one, depth=depth: abs(
             np.median(depth) - np.median(one.depth)))
-        assert np.median(depth) == pytest.approx(np.median(shot.depth), abs=5e-3)
+        # NeRFCapture's is enlarged by a factor that is not whole, which moves the median.
+        assert np.median(depth) == pytest.approx(np.median(shot.depth), abs=1e-2)
 
 
 def test_a_packed_recording_gives_what_the_folder_gives(frames, tmp_path):

@@ -1,5 +1,7 @@
 """Captures of scanning apps through ingest and sfm: the cameras end where they were, z up."""
 
+import shutil
+
 import numpy as np
 import pytest
 from app_sets import APPS, shots
@@ -18,6 +20,7 @@ def test_kept_poses_end_in_metres_with_z_up(name, shared_data, tmp_path):
     taken = shots(shared_data / "rooms" / "office", count=12, step=5, factor=1)
     app.write(tmp_path / "capture", taken)
     take(tmp_path / "capture", tmp_path / "ingest")
+    shutil.copytree(tmp_path / "ingest" / "frames", tmp_path / "denoise" / "frames")
     summary = run(tmp_path, tmp_path / "sfm", poses="keep")
     assert summary.world.evidence.metres
     listed = read_frame_list(tmp_path / "ingest").frames
