@@ -42,6 +42,6 @@ def find_rooms(folder: Path) -> tuple[Path, ...]:
             raise InputError(f"{room} has no {lacks}.", hint=_LAYOUT)
     missing = [name for name in TABLE_I if name not in by_name]
     if missing:
-        logger.warning("notice: %s does not hold %s; their rows show the printed scores alone",
+        logger.warning("%s does not hold %s; their rows show the printed scores alone",
                        folder, list_names(missing))
     return tuple(rooms)

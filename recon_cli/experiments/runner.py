@@ -256,13 +256,19 @@ class Runner:
         self._base, self._progress = base, progress
         self._machine, self._records = machine, records
 
-    def pilot_seconds(self, loaded: LoadedScene, variants: Sequence[Variant]) -> dict[str, float]:
-        """Returns the approximate seconds of a step by variant; the pilots also warm caches."""
+    def pilot_seconds(
+        self, loaded: LoadedScene, variants: Sequence[Variant], *, most: int = PILOT_STEPS
+    ) -> dict[str, float]:
+        """Returns the approximate seconds of a step by variant; the pilots also warm caches.
+
+        They take PILOT_STEPS, or `most` where the runs are shorter.
+        """
         seconds = {}
         label = f"{loaded.folders.name}: pilots"
         with self._progress.bar(label, len(variants), unit="variant") as bar:
             for variant in variants:
-                seconds[variant.name] = run_pilot(loaded, variant).seconds / PILOT_STEPS
+                point = run_pilot(loaded, variant, min(PILOT_STEPS, most))
+                seconds[variant.name] = point.seconds / min(PILOT_STEPS, most)
                 bar.advance()
         return seconds
 
@@ -394,9 +400,9 @@ def _prune_run(
         score=config.score, beta=config.beta, callbacks=callbacks)
 
 
-def run_pilot(loaded: LoadedScene, variant: Variant) -> CurvePoint:
+def run_pilot(loaded: LoadedScene, variant: Variant, steps: int = PILOT_STEPS) -> CurvePoint:
     """Returns the end of a short run of the whole recipe, after a few steps that warm caches."""
-    for iterations in (_WARM_STEPS, PILOT_STEPS):
+    for iterations in (_WARM_STEPS, steps):
         points = run_trial(
             loaded, TrainingRun(variant, loaded.base, iterations, 0), (), on_step=lambda: None)
     return points[-1]

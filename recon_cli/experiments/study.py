@@ -241,7 +241,8 @@ class Study:
             missing += sum(counts.values())
             if any(counts.values()):
                 costs = {name: iterations * step for name, step in
-                         self._runner.pilot_seconds(loaded, self._variants).items()}
+                         self._runner.pilot_seconds(
+                             loaded, self._variants, most=iterations).items()}
                 loaded.release()
                 seconds += sum(
                     costs[name] * min(count, seeds) + max(costs.values()) * max(0, count - seeds)

@@ -156,8 +156,8 @@ def _is_unlimited(config: TrainConfig) -> bool:
 def _likely(config: RunConfig, facts: Facts) -> RunConfig:
     """Returns the options with the count that a run is likely to end with, to tell its time.
 
-    Where memory is the limit it ends about where `cap` would: on bonsai, after 30,000 steps of the
-    reference, at TODO.
+    Where memory is the limit that is told by `useful_cap`, and may well be more: 577,000 for bonsai
+    and 30,000 steps, where the reference ended with 974,000.
     """
     if not _is_unlimited(config):
         return config
