@@ -228,6 +228,6 @@ def test_depth_beside_few_photos_is_not_taken_for_photos(tmp_path):
     for number in range(4):
         Image.new("RGB", (80, 60), (number, 90, 60)).save(tmp_path / f"frame_{number:05d}.jpg")
     found = list_photos(sorted(tmp_path.iterdir())).photos
-    rest, notices = drop_other_pictures(tmp_path, found)
+    rest, notices = choose(tmp_path, found)
     assert {photo.name for photo in rest} == {f"frame_{number:05d}.jpg" for number in range(4)}
     assert len(notices) == 2
