@@ -98,7 +98,7 @@ class SfmConfig(StageConfig):
         "auto", "Image pairs to match. auto: pairs that a first rough reconstruction shows to "
         "overlap; then more pairs and other mappers if the model is poor.",
         choices=("auto", "exhaustive", "retrieval", "sequential"))
-    camera: str = option(
+    camera_model: str = option(
         "auto", "Camera model of lenses that are not known, by COLMAP's name; auto: OPENCV, or "
         "OPENCV_FISHEYE if the matches show a fisheye.",
         metavar="MODEL", late=True)

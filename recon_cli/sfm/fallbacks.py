@@ -185,7 +185,7 @@ def _begin_with_fisheye(
                         "as fisheyes.")
         return ways
     named = any("FISHEYE" in group.model for group in job.groups)
-    reason = "--camera asks for it" if named else "the matches are those of a fisheye lens"
+    reason = "--camera-model asks for it" if named else "the matches are those of a fisheye lens"
     fisheye = Fallback(wide_lens.ATTEMPT, reason, lambda *_: set(), wide_lens.map_fisheye)
     return (fisheye, dataclasses.replace(ways[0], choose_pairs=lambda *_: set()), *ways[1:])
 

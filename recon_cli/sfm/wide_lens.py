@@ -39,7 +39,7 @@ Sample = tuple[NDArray[np.float64], NDArray[np.float64]]  # pixels [M, 2] of mat
 def find_fisheyes(job: MappingJob) -> dict[int, float]:
     """Returns the focal lengths in pixels of cameras that are fisheyes, by their numbers.
 
-    These are the cameras that --camera calls so, and those whose matches show it clearly.
+    These are the cameras that --camera-model calls so, and those whose matches show it clearly.
     """
     unknown = {number: group for number, group in enumerate(job.groups, start=1)
                if group.lens is None and (group.model == "auto" or "FISHEYE" in group.model)}
@@ -93,7 +93,7 @@ def map_fisheye(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstructi
 def _camera(
     group: CameraGroup, model: str, focal_px: float, number: int = 1
 ) -> pycolmap.Camera:
-    """Returns a camera of a group without distortion, of the fisheye that --camera names if so."""
+    """Returns an undistorted camera of a group, of the fisheye that --camera-model names if so."""
     if model == FISHEYE and group.model != "auto":
         model = group.model
     camera = pycolmap.Camera.create_from_model_name(

@@ -14,7 +14,7 @@ from recon_cli.errors import ConfigError, FormatError, format_count, list_names
 from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.jobs.executor import Executor, start_executor
 from recon_cli.room.scale import parse_place
-from recon_cli.scene.camera import MODELS
+from recon_cli.scene.camera import MODELS, PANORAMA
 from recon_cli.sfm import database, parts, process, segments
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
 from recon_cli.sfm.results import MappingResult
@@ -60,7 +60,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     known = read_poses(poses) if poses.exists() else None
     job = MappingJob(
         frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER, out=out.resolve(),
-        groups=_groups(frames, config.camera),
+        groups=_groups(frames, config.camera_model),
         masks=ingest / store.MASKS if any(frame.masked for frame in frames.frames) else None,
         poses=poses if known else None, pose_use=_pose_use(config, known),
         given_points=known is not None and known.points is not None,
@@ -153,10 +153,11 @@ def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
 
 
 def _groups(frames: FrameList, model: str) -> tuple[CameraGroup, ...]:
-    if model not in ("auto", *MODELS):
+    models = [name for name in MODELS if name != PANORAMA]  # ingest recognises those
+    if model not in ("auto", *models):
         raise ConfigError(
-            f"camera is {model!r}, which is not a camera model of COLMAP.",
-            hint=f"Give --camera auto or one of {', '.join(MODELS)}.")
+            f"camera_model is {model!r}, which is not a model of COLMAP for a lens.",
+            hint=f"Give --camera-model auto or one of {', '.join(models)}.")
     return tuple(
         CameraGroup(
             tuple(frame.name for frame in frames.frames if frame.group == index),

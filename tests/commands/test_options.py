@@ -176,4 +176,4 @@ def test_some_fields_can_be_left_out() -> None:
 
 def test_the_camera_model_leaves_results_from_before_fresh() -> None:
     assert "camera" not in SfmConfig().hashed_fields()
-    assert SfmConfig(camera="RADIAL").hashed_fields()["camera"] == "RADIAL"
+    assert SfmConfig(camera_model="RADIAL").hashed_fields()["camera_model"] == "RADIAL"

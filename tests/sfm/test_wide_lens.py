@@ -125,7 +125,7 @@ def test_an_ordinary_capture_is_mapped_as_before(tmp_path):
     named = dataclasses.replace(job, groups=(
         dataclasses.replace(job.groups[0], model="OPENCV_FISHEYE"),))
     first, second, *_ = fallbacks._begin_with_fisheye(named, ways, report)
-    assert (first.name, first.reason) == ("fisheye", "--camera asks for it")
+    assert (first.name, first.reason) == ("fisheye", "--camera-model asks for it")
     assert second.name == ways[0].name
 
 
