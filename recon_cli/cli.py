@@ -27,7 +27,7 @@ MAX_WIDTH = 100  # columns of a help text on a wide terminal
 
 # Each verb: where its command lives in recon_cli.commands, and the first line of its docstring.
 VERBS = {
-    "ingest": ("stages.ingest", "Choose frames from videos, photos or a data set with poses."),
+    "ingest": ("stages.ingest", "Choose frames from videos, photos or a capture with poses."),
     "denoise": ("stages.denoise", "Filter noisy frames and pass the others through."),
     "sfm": ("stages.sfm", "Estimate cameras and a sparse point cloud."),
     "train": ("stages.train", "Fit Gaussians; denoise and sfm run first where needed."),

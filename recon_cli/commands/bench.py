@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,9 +108,8 @@ class _OldSpelling(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parses the words after the verb."""
-        pairs = zip(args, [*args[1:], ""], strict=True)
         words = ["--out" if word == "--json" and after.endswith(".json")
-                 else re.sub(r"^--json=", "--out=", word) for word, after in pairs]
+                 else re.sub(r"^--json=", "--out=", word) for word, after in pairwise([*args, ""])]
         return super().parse_args(ctx, words)
 
 

@@ -174,7 +174,9 @@ def _without_opacity(read: Callable[[], NDArray[np.uint8]]) -> Pixels:
 
 def _decoded(rgb: NDArray[np.uint8] | None, label: str) -> Pixels:
     if rgb is None:
-        raise InputError(f"{label} cannot be decoded.")
+        raise InputError(
+            f"{label} cannot be decoded.",
+            hint="Copy the recording again; or play it to see whether it is whole.")
     return rgb, None
 
 

@@ -1,4 +1,4 @@
-"""ingest: from videos, photos or a data set with poses to upright 8-bit frames."""
+"""ingest: from videos, photos or a capture with poses to upright 8-bit frames."""
 
 from __future__ import annotations
 

@@ -451,8 +451,8 @@ def test_poses_and_lists_beside_photos_are_named(tmp_path, notices):
     (folder / "bundle.out").write_text("# Bundle file v0.3\n")
     (folder / "places.txt").write_text("".join(f"IMG_{k:04d}.jpg 1 2 3\n" for k in range(3)))
     take(folder, tmp_path / "out")
-    assert any("bundle.out is cameras in Bundler's format: its poses are not read" in notice
-               for notice in notices())
+    assert any("bundle.out is cameras in Bundler's format, but files that belong to it are missing"
+               in notice for notice in notices())
     assert any("places.txt names the photos and is not read" in notice for notice in notices())
     found = len(notices())
     take(tuple(sorted(folder.glob("*.jpg"))), tmp_path / "files")

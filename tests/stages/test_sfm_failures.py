@@ -207,6 +207,6 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted():
 
 def test_a_camera_model_that_colmap_does_not_have_is_refused_by_name(tmp_path):
     inputs = write_inputs(tmp_path, turning(3))
-    with pytest.raises(ConfigError, match="camera is 'GOPRO'") as caught:
-        run(inputs, tmp_path / "out", camera="GOPRO")
+    with pytest.raises(ConfigError, match="camera_model is 'GOPRO'") as caught:
+        run(inputs, tmp_path / "out", camera_model="GOPRO")
     assert "OPENCV_FISHEYE" in caught.value.hint

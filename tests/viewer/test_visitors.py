@@ -5,11 +5,11 @@ import http.client
 import http.server
 import socket
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import viser
 import websockets
-from browser import launch_browser, watch_page
 
 from recon_cli.viewer import visitors
 from recon_cli.viewer.server import HOST, start_server
@@ -58,7 +58,9 @@ def connect(address, **options):
         ) as connection:
             return await connection.recv()
 
-    return asyncio.run(first())
+    # In a thread of its own: playwright's loop runs in this one once a browser was asked for.
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(lambda: asyncio.run(first())).result()
 
 
 def test_a_client_of_another_origin_gets_nothing_and_one_of_its_own_the_scene():
@@ -88,7 +90,7 @@ def test_a_server_that_would_admit_strangers_does_not_run():
         assert visitors.websocket_server.serve is before
 
 
-def test_a_foreign_page_in_a_browser_cannot_read_the_scene(tmp_path):
+def test_a_foreign_page_in_a_browser_cannot_read_the_scene(tmp_path, page):
     with start_server(HOST, None, label="x") as (_, address):
         text = PAGE.replace("ADDRESS", address.removeprefix("http://"))
         (tmp_path / "page.html").write_text(text.replace("VERSION", viser.__version__))
@@ -102,8 +104,7 @@ def test_a_foreign_page_in_a_browser_cannot_read_the_scene(tmp_path):
 
         with http.server.HTTPServer((HOST, 0), Quiet) as foreign:
             threading.Thread(target=foreign.serve_forever, daemon=True).start()
-            with launch_browser() as browser, watch_page(browser) as watched:
-                watched.page.goto(f"http://{HOST}:{foreign.server_port}/page.html")
-                watched.page.wait_for_function("document.title", timeout=60_000)
-                assert watched.page.title() == "refused"
+            page.page.goto(f"http://{HOST}:{foreign.server_port}/page.html")
+            page.page.wait_for_function("document.title", timeout=60_000)
+            assert page.page.title() == "refused"
             foreign.shutdown()
