@@ -103,7 +103,8 @@ def test_ctrl_c_ends_it_without_a_word_too_many_and_frees_the_port(room):
         port = free.getsockname()[1]
     process = subprocess.Popen(
         [sys.executable, "-m", "recon_cli", "view", str(room), "--port", str(port)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"})
     killer = threading.Timer(120, process.kill)
     killer.start()
     try:
