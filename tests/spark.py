@@ -24,13 +24,34 @@ import {SplatMesh} from "./spark.module.min.js";
 window.decode = async url => {
   const mesh = new SplatMesh({url}), rows = [];
   await mesh.initialized;
-  mesh.forEachSplat((i, center, scales, quat, opacity, color) => rows.push(
+  // with a tree, its Gaussians and those of the levels
+  (mesh.packedSplats.lodSplats ?? mesh).forEachSplat((i, center, scales, quat, opacity, color) => rows.push(
     [...center.toArray(), ...scales.toArray(), ...quat.toArray(), opacity, ...color.toArray()]));
   const extra = Object.entries(mesh.packedSplats.extra).filter(
     ([name, words]) => /^sh\\d$/.test(name) && words);
   return [rows, Object.fromEntries(extra.map(([name, words]) => [name, [...words]]))];
 };
 </script>"""
+
+
+def decode(page: WatchedPage, path: Path) -> Any:
+    """Returns the rows and the coefficients that Spark reads from a file.
+
+    A row is centre, sizes, quaternion xyzw, opacity and colour. Fails where Spark complains.
+    """
+    def answer(route: Route) -> None:
+        name = route.request.url.removeprefix(_ADDRESS)
+        if not name:
+            route.fulfill(body=_PAGE, content_type="text/html")
+        else:
+            route.fulfill(path=path if name == path.name else _WEB / name)
+
+    page.page.route(f"{_ADDRESS}**", answer)
+    page.page.goto(_ADDRESS)
+    page.page.wait_for_function("window.decode")
+    found = page.page.evaluate("name => window.decode(name)", path.name)
+    page.assert_silent()
+    return found
 
 
 def assert_spark_agrees(page: WatchedPage, path: Path, splats: Splats) -> None:
@@ -41,21 +62,7 @@ def assert_spark_agrees(page: WatchedPage, path: Path, splats: Splats) -> None:
     """
     again = path.with_name("again.ply")
     write_ply(again, splats)
-
-    def answer(route: Route) -> None:
-        name = route.request.url.removeprefix(_ADDRESS)
-        if not name:
-            route.fulfill(body=_PAGE, content_type="text/html")
-        else:
-            route.fulfill(path=path.with_name(name) if name in (path.name, again.name)
-                          else _WEB / name)
-
-    page.page.route(f"{_ADDRESS}**", answer)
-    page.page.goto(_ADDRESS)
-    page.page.wait_for_function("window.decode")
-    decode: Any = "name => window.decode(name)"
-    rows, harmonics = page.page.evaluate(decode, path.name)
-    page.assert_silent()
+    rows, harmonics = decode(page, path)
     table = np.array(rows)
     quats = splats.quats.double().numpy()[:, [1, 2, 3, 0]]
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -68,4 +75,4 @@ def assert_spark_agrees(page: WatchedPage, path: Path, splats: Splats) -> None:
     assert np.allclose(table[:, 10], splats.opacities.numpy(), atol=0.005)
     assert np.allclose(table[:, 11:].clip(0, 1), colors.clip(0, 1), atol=0.005)
     assert len(harmonics) == splats.sh_degree
-    assert harmonics == page.page.evaluate(decode, again.name)[1]
+    assert harmonics == decode(page, again)[1]

@@ -31,20 +31,20 @@ def coarsen(splats: Splats, count: int) -> Splats:
 
     All of them have coefficients if any has. Pairs that change least are merged first.
     """
-    current = _Moments.from_splats(splats)
+    current = Moments.from_splats(splats)
     while len(current.mass) > max(1, count):
         current = _merge_once(current, len(current.mass) - max(1, count))
     return current.splats()
 
 
-class _Moments:
+class Moments:
     """N Gaussians by mass, mean and covariance, with colours [N, 1 + T, 3] as coefficients."""
 
     def __init__(self, mass: Doubles, mean: Doubles, covariance: Doubles, color: Doubles) -> None:
         self.mass, self.mean, self.covariance, self.color = mass, mean, covariance, color
 
     @classmethod
-    def from_splats(cls, splats: Splats) -> _Moments:
+    def from_splats(cls, splats: Splats) -> Moments:
         """Returns the moments of Gaussians."""
         scales = np.exp(_array(splats.log_scales))
         quats = _array(splats.quats)
@@ -58,9 +58,9 @@ class _Moments:
             opacity * _area(scales), _array(splats.means), axes @ axes.transpose(0, 2, 1),
             np.concatenate([_array(splats.sh_dc)[:, None], rest], axis=1))
 
-    def select(self, rows: NDArray[np.bool_] | Rows) -> _Moments:
+    def select(self, rows: NDArray[np.bool_] | Rows) -> Moments:
         """Returns some of them."""
-        return _Moments(
+        return Moments(
             self.mass[rows], self.mean[rows], self.covariance[rows], self.color[rows])
 
     def splats(self) -> Splats:
@@ -87,9 +87,13 @@ def _area(scales: Doubles) -> Doubles:
     return np.asarray(np.sort(scales, axis=1)[:, 1:].prod(axis=1))
 
 
-def _merge_once(moments: _Moments, most: int) -> _Moments:
+def _merge_once(moments: Moments, most: int) -> Moments:
     """Returns the Gaussians after at most `most` merges; each takes part in one."""
-    first, second = _match(moments, most)
+    return merge_pairs(moments, *match_pairs(moments, most))
+
+
+def merge_pairs(moments: Moments, first: Rows, second: Rows) -> Moments:
+    """Returns the Gaussians that are in no pair, in their order, and then the merged pairs."""
     pairs = [moments.select(first), moments.select(second)]
     mass = pairs[0].mass + pairs[1].mass
     shares = [pair.mass / mass for pair in pairs]
@@ -104,12 +108,12 @@ def _merge_once(moments: _Moments, most: int) -> _Moments:
     alone = np.ones(len(moments.mass), np.bool_)
     alone[first] = alone[second] = False
     kept = moments.select(alone)
-    return _Moments(
+    return Moments(
         np.concatenate([kept.mass, mass]), np.concatenate([kept.mean, mean]),
         np.concatenate([kept.covariance, covariance]), np.concatenate([kept.color, color]))
 
 
-def _match(moments: _Moments, most: int) -> tuple[Rows, Rows]:
+def match_pairs(moments: Moments, most: int) -> tuple[Rows, Rows]:
     """Returns the rows of at most `most` pairs of neighbours, the cheapest of those found."""
     count = len(moments.mass)
     _, near = cKDTree(moments.mean).query(
@@ -145,7 +149,7 @@ def _match(moments: _Moments, most: int) -> tuple[Rows, Rows]:
     return first[chosen], second[chosen]
 
 
-def _costs(moments: _Moments, near: Rows) -> Doubles:
+def _costs(moments: Moments, near: Rows) -> Doubles:
     """Returns the cost of merging each Gaussian with each of its neighbours [N, K]."""
     cost = np.empty(near.shape)
     variance = np.trace(moments.covariance, axis1=1, axis2=2) / 3

@@ -1,4 +1,4 @@
-"""The .rad of Spark, version 1: a scene in chunks, with or without a tree of levels; only read.
+"""The .rad of Spark, version 1: a scene in chunks, with or without a tree of levels.
 
 A file is RAD0, the length of a JSON, the JSON filled up to 8 bytes, and the chunks that it lists. A
 chunk is RADC, length and JSON likewise, the size of its properties (u64), and these, raw deflate
@@ -11,6 +11,7 @@ Source: https://github.com/sparkjsdev/spark, rust/spark-lib/src/rad.rs. Chunks i
 
 from __future__ import annotations
 
+import json
 import math
 import zlib
 from collections.abc import Callable, Mapping
@@ -20,10 +21,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.scene.splats import SH_C0, TERMS
+from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.splats.foreign import FLAT, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat
-from recon_cli.splats.values import UntrustedFile, splats_from_arrays
+from recon_cli.splats.merge_tree import MergeTree, build_tree
+from recon_cli.splats.values import (
+    UntrustedFile,
+    refuse_not_finite,
+    sigmoid,
+    splats_from_arrays,
+    to_arrays,
+)
+from recon_cli.workspace.atomic import write_bytes
 
 _MAGIC, _CHUNK_MAGIC = b"RAD0", b"RADC"
 _MOST_SPLATS, _MOST_CHUNKS, _CHUNK = 1 << 31, 1 << 16, 1 << 16
@@ -221,4 +230,87 @@ _ENCODINGS: dict[str, Callable[[Array, int, float, float], Array]] = {
     "u32": lambda data, k, *_: _columns(data.view("<u4"), k),
 }
 
-FORMAT = SplatFormat(load=load_rad)
+def write_rad(path: Path, splats: Splats) -> None:
+    """Writes a scene, and a tree of levels over it, of which Spark loads what it shows.
+
+    FormatError if there are no Gaussians, a value is not finite, or a colour is above 65504.
+    """
+    to_arrays(splats, path.name)  # refuses what cannot be written before the tree is made
+    tree = build_tree(splats)
+    degree, count = tree.splats.sh_degree, len(tree.splats)
+    columns = _encode(tree, path)
+    chunks = [_pack_chunk(columns, degree, base, min(_CHUNK, count - base))
+              for base in range(0, count, _CHUNK)]
+    ends = np.cumsum([len(chunk) for chunk in chunks])
+    rgb = columns["rgb"][1]
+    meta = {
+        "version": 1, "type": "gsplat", "count": count, "maxSh": degree, "lodTree": True,
+        "chunkSize": _CHUNK, "allChunkBytes": int(ends[-1]),
+        "chunks": [{"offset": int(end) - len(chunk), "bytes": len(chunk)}
+                   for end, chunk in zip(ends, chunks, strict=True)],
+        # Spark packs colours into bytes of this range
+        "splatEncoding": {
+            "rgbMin": min(0.0, float(rgb.min())), "rgbMax": max(1.0, float(rgb.max())),
+            "lodOpacity": True},
+        "comment": "recon"}
+    write_bytes(path, b"".join([_pack_json(_MAGIC, meta), *chunks]))
+
+
+def _encode(tree: MergeTree, path: Path) -> dict[str, tuple[str, Array]]:
+    """Returns encoding and values [M, components] of each property."""
+    values = to_arrays(tree.splats, path.name)
+    # the real part is positive, as it follows from the others
+    quats = np.where(values["quats"][:, :1] < 0, -values["quats"], values["quats"])
+    with np.errstate(over="ignore"):  # an infinity is refused below
+        rgb = (SH_C0 * values["sh_dc"] + 0.5).astype("<f2")
+    columns = {
+        "center": ("f32_lebytes", values["means"].astype("<f4")),
+        "alpha": ("f16", sigmoid(values["logit_opacities"])[:, None].astype("<f2")),
+        "rgb": ("f16", rgb),
+        "scales": ("ln_f16", values["log_scales"].astype("<f2")),
+        "orientation": ("f32", quats[:, 1:].astype("<f4")),
+        "child_count": ("u16", tree.child_count[:, None].astype("<u2")),
+        "child_start": ("u32", tree.child_start[:, None].astype("<u4"))}
+    refuse_not_finite(f"The scene for {path.name}, in float16,", {
+        name: columns[name][1] for name in ("rgb", "scales")})
+    coefficients = values["sh_rest"].reshape(len(quats), -1)
+    for degree in range(1, tree.splats.sh_degree + 1):
+        first = 3 * TERMS[degree - 1]
+        columns[f"sh{degree}"] = "s8", coefficients[:, first: first + _BAND[degree]]
+    return columns
+
+
+def _pack_chunk(
+    columns: Mapping[str, tuple[str, Array]], degree: int, base: int, count: int
+) -> bytes:
+    """Returns a chunk of `count` Gaussians from number `base` on."""
+    properties: list[dict[str, Any]] = []
+    payload = bytearray()
+    for name, (encoding, values) in columns.items():
+        plane = np.ascontiguousarray(values[base: base + count].T)
+        meta: dict[str, Any] = {"property": name, "encoding": encoding, "compression": "gz"}
+        if encoding == "s8":
+            most = max(float(abs(plane).max()), 1e-6)
+            meta |= {"min": -most, "max": most}
+            plane = np.rint(plane / most * 127).astype(np.int8)
+        data = plane.tobytes()
+        if encoding == "f32_lebytes":
+            data = np.frombuffer(data, np.uint8).reshape(-1, 4).T.tobytes()
+        packer = zlib.compressobj(wbits=-zlib.MAX_WBITS)
+        packed = packer.compress(data) + packer.flush()
+        properties.append({"offset": len(payload), "bytes": len(packed), **meta})
+        payload += packed + bytes(-len(packed) % _WORD)
+    return _pack_json(_CHUNK_MAGIC, {
+        "version": 1, "base": base, "count": count, "payloadBytes": len(payload), "maxSh": degree,
+        "lodTree": True, "properties": properties,
+    }) + len(payload).to_bytes(_WORD, "little") + payload
+
+
+def _pack_json(magic: bytes, meta: Mapping[str, Any]) -> bytes:
+    """Returns a JSON with its length, filled up."""
+    text = json.dumps(meta, allow_nan=False).encode()
+    return magic + len(text).to_bytes(4, "little") + text + bytes(-len(text) % _WORD)
+
+
+FORMAT = SplatFormat(
+    load_rad, lambda path, splats, _: write_rad(path, splats.with_sphere()))

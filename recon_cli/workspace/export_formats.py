@@ -73,6 +73,7 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
         "splats.jpg",), options=("title", "credits")),
     ExportFormat("lod", "gaussians", "lod/lod-meta.json", "recon_cli.splats.lod", more_files=(
         "lod/*",), options=("max_loss",), sharing=_SHARING),
+    ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad"),
     ExportFormat("points.ply", "points", "points.ply"),
     ExportFormat("colmap", "cameras", "sparse/0", index="images.bin", more_files=(
         "sparse/*", "images/*", "database.db", "colmap/*")),  # colmap/: before version 5
@@ -90,7 +91,6 @@ OTHER_NAMES = {"nerfstudio": "transforms.json"}
 # Formats that are read, but not written.
 READ_ONLY: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("ksplat", "gaussians", "splats.ksplat", "recon_cli.splats.ksplat"),
-    ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad"),
 )}
 
 READABLE: tuple[ExportFormat, ...] = (  # all that Gaussians are read from
