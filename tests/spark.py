@@ -25,7 +25,8 @@ window.decode = async url => {
   const mesh = new SplatMesh({url}), rows = [];
   await mesh.initialized;
   // with a tree, its Gaussians and those of the levels
-  (mesh.packedSplats.lodSplats ?? mesh).forEachSplat((i, center, scales, quat, opacity, color) => rows.push(
+  const all = mesh.packedSplats.lodSplats ?? mesh;
+  all.forEachSplat((i, center, scales, quat, opacity, color) => rows.push(
     [...center.toArray(), ...scales.toArray(), ...quat.toArray(), opacity, ...color.toArray()]));
   const extra = Object.entries(mesh.packedSplats.extra).filter(
     ([name, words]) => /^sh\\d$/.test(name) && words);
