@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.image_file import ImageFile
+
+if TYPE_CHECKING:  # ingest and denoise handle images without it: it takes a second to import
+    import torch
+    from torch import Tensor
 
 MIN_SIDE = 11  # pixels; the window of SSIM
 MIN_PIXELS = MIN_SIDE**2  # that a mask must leave: one window of SSIM
@@ -45,15 +47,21 @@ class TrainView:
         """
         if self.file is not None:
             return self
+        import torch
+
         mask = None if self.mask is None else torch.from_numpy(self.mask).pin_memory().numpy()
         return TrainView(self.camera, torch.from_numpy(self.image).pin_memory().numpy(), mask)
 
     def pixels(self, device: torch.device) -> Tensor:
         """Returns the image as float32 in [0, 1], [H, W, 3]."""
+        import torch
+
         return torch.from_numpy(self.image).to(device).float() / 255
 
     def counting(self, device: torch.device) -> Tensor | None:
         """Returns the mask, [H, W] bool."""
+        import torch
+
         return None if self.mask is None else torch.from_numpy(self.mask).to(device)
 
 

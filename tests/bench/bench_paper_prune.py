@@ -73,9 +73,9 @@ GRID = (
 NONE = "3DGS"
 
 
-def make_runs(loaded: LoadedScene, seed: int, steps: int, skip: set[str], scratch: Path
+def make_runs(loaded: LoadedScene, seed: int, steps: int, wanted: set[str], scratch: Path
               ) -> Iterator[dict[str, object]]:
-    """Yields the score of 3DGS and of every setting that is not to be skipped."""
+    """Yields the score of 3DGS and of every wanted setting."""
     run = TrainingRun(REFERENCE, loaded.base, steps, seed)
     task = loaded.task(run)
     config = task.schedule.config
@@ -95,10 +95,10 @@ def make_runs(loaded: LoadedScene, seed: int, steps: int, skip: set[str], scratc
                 "psnr_db": found.psnr_db, "ssim": found.ssim, "gaussians": len(splats),
                 "cpu_seconds": round(seconds, 1)}
 
-    if NONE not in skip:
+    if NONE in wanted:
         yield score(NONE, time.process_time() - begin)
     for setting in GRID:
-        if setting.name in skip:
+        if setting.name not in wanted:
             continue
         begin = time.process_time()
         state = restore_state(scratch / f"{setting.at:.3f}.safetensors", task)
@@ -145,8 +145,10 @@ def difference_table(rows: list[dict[str, object]]) -> Table:
 @click.option("--max-size", default=400)
 @click.option("--max-gaussians", default=80_000)
 @click.option("--threads", default=2)
+@click.option("--setting", "only", multiple=True, type=click.Choice([s.name for s in GRID]),
+              help="This setting alone; may be repeated.")
 def main(scenes: tuple[Path, ...], out: Path, seeds: int, iterations: int, max_size: int,
-         max_gaussians: int, threads: int) -> None:
+         max_gaussians: int, threads: int, only: tuple[str, ...]) -> None:
     """Makes the missing runs and prints the table after each scene."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / "runs.jsonl"
@@ -155,7 +157,7 @@ def main(scenes: tuple[Path, ...], out: Path, seeds: int, iterations: int, max_s
     base = RunConfig(max_size=max_size, max_gaussians=max_gaussians, validation=0.0,
                      early_stop=False, images="original")
     ctx = render_context(compute, NullProgress())
-    wanted = {NONE, *(setting.name for setting in GRID)}
+    wanted = {NONE, *(only or (setting.name for setting in GRID))}
     for seed in range(seeds):
         for name, path in check_scenes(scenes).items():
             done = {row["setting"] for row in rows
@@ -164,7 +166,7 @@ def main(scenes: tuple[Path, ...], out: Path, seeds: int, iterations: int, max_s
                 continue
             loaded = load_for_training(
                 open_scene(name, path, out, {}, compute, NullProgress()), "test", base, ctx)
-            for row in make_runs(loaded, seed, iterations, done, out):
+            for row in make_runs(loaded, seed, iterations, wanted - done, out):
                 rows.append(row)
                 with file.open("a") as stream:
                     stream.write(json.dumps(row) + "\n")
