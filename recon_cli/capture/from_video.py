@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -249,12 +251,26 @@ def _write(
     missing = {index for index, name in names.items() if not (folder / name).exists()}
     done = len(names) - len(missing)
     threads = decode_threads(source.scan, ctx.threads)
-    with ctx.progress.bar("frames", len(names), unit="frame", done=done) as bar:
+    with (ctx.progress.bar("frames", len(names), unit="frame", done=done) as bar,
+          ThreadPoolExecutor(ctx.threads) as pool):
+        writing: deque[Future[None]] = deque()
+
+        def wait(most: int) -> None:
+            """Returns when at most so many frames are still being written."""
+            nonlocal done
+            while len(writing) > most:
+                writing.popleft().result()
+                done += 1
+                bar.advance()
+                ctx.record(done, len(names))
+
         for index, rgb in frames_at(source.path, missing | sheet.wanted, threads=threads):
             sheet.add(index, rgb)
-            if index not in missing:
-                continue
-            write_png(folder / names[index], fit_image(rgb, max_size))
-            done += 1
-            bar.advance()
-            ctx.record(done, len(names))
+            if index in missing:
+                writing.append(pool.submit(_store, folder / names[index], rgb, max_size))
+                wait(most=ctx.threads)
+        wait(most=0)
+
+
+def _store(file: Path, rgb: NDArray[np.uint8], max_size: int) -> None:
+    write_png(file, fit_image(rgb, max_size))

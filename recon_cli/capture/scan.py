@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -146,16 +147,18 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     gaps: list[tuple[int, int | None]] = []  # (frames before it, pts)
     first: DecodedPicture | None = None
     meter, tracker, overlay = MotionMeter(), Tracker(), OverlayMeter()
-    for item in video.decode(path, threads=threads):
-        if isinstance(item, Gap):
-            gaps.append((len(measures), item.pts))
-            continue
-        first = first or item
-        gray = item.gray()
-        measures.append(_measure(item, gray, meter))
-        tracker.advance(gray)
-        overlay.advance(gray, *tracker.corners)
-        step()
+    with ThreadPoolExecutor(1) as beside:  # the two halves take about as long
+        for item in video.decode(path, threads=threads):
+            if isinstance(item, Gap):
+                gaps.append((len(measures), item.pts))
+                continue
+            first = first or item
+            gray = item.gray()
+            measured = beside.submit(_measure, item, gray, meter)
+            tracker.advance(gray)
+            overlay.advance(gray, *tracker.corners)
+            measures.append(measured.result())
+            step()
     if first is None:
         raise _nothing_decoded(path)
     width, height = first.size
