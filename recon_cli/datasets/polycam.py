@@ -93,10 +93,7 @@ def _list_keyframe(path: Path, camera: Path, left_out: LeftOut) -> PosedImage | 
     lens = left_out.lens(path.name, size, _intrinsics, value)
     if lens is None:
         return None
-    blur = value.get("blur_score")
-    return PosedImage(
-        path.name, path, lens, viewmat, time=int(path.stem) / 1e6,
-        blur=float(blur) if isinstance(blur, (int, float)) else None)
+    return PosedImage(path.name, path, lens, viewmat, time=int(path.stem) / 1e6)
 
 
 def _pose(value: dict[str, Any]) -> list[list[float]]:

@@ -43,7 +43,6 @@ class PosedImage:
     time: float | None = None  # seconds, on the clock of the capture
     read: Callable[[], NDArray[np.uint8]] | None = None  # returns RGB [H, W, 3] of other files
     rim: int = 0  # pixels along the border that may be black and are masked
-    blur: float | None = None  # by the app; more is blurrier, and only within one set
 
     @property
     def is_picture(self) -> bool:

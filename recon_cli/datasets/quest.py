@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.app_frames import (
     LeftOut,
+    fit_intrinsics,
     numbers,
     pose_from_quat,
     quoted,
@@ -111,10 +112,16 @@ def _read_lens(path: Path) -> Lens:
     try:
         focal, center, size = value["focalLength"], value["principalPoint"], value["resolution"]
         params = [float(pair[axis]) for pair in (focal, center) for axis in "xy"]
-        return make_lens("PINHOLE", float(size["width"]), float(size["height"]), params, str(path))
+        lens = make_lens("PINHOLE", float(size["width"]), float(size["height"]), params, str(path))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
             f"{path} lacks focalLength, principalPoint or resolution.", hint=_HINT) from error
+    _, factor = fit_intrinsics(lens.params, (lens.width, lens.height), str(path))
+    if factor != 1:
+        raise FormatError(
+            f"{path} has the principal point {params[2]:.0f}, {params[3]:.0f}, but the resolution "
+            f"{lens.width}x{lens.height}: they are those of different sizes.", hint=_HINT)
+    return lens
 
 
 def _own_lens(lens: Lens, row: Mapping[str, str]) -> Lens:

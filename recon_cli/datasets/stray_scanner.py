@@ -52,7 +52,7 @@ def read_stray(folder: Path) -> PosedSet:
     rows = read_csv(odometry, ("frame", *_POSE))
     size, count = _measure(video)
     inner, notices = _read_matrix(folder / _MATRIX, size, rows)
-    depths = list_numbered(folder / "depth", (".png",))
+    depths = list_numbered(folder / "depth", (".png", ".npy"))  # .npy: old versions
     levels = list_numbered(folder / "confidence", (".png",))
     left_out, listed, seen = LeftOut(), [], set[int]()
     for row in rows:
@@ -68,7 +68,7 @@ def read_stray(folder: Path) -> PosedSet:
         viewmat = left_out.pose(name, _pose, row, opengl=False)
         if viewmat is None:
             continue
-        lens = left_out.lens(name, size, _intrinsics, row, inner, size)
+        lens = left_out.lens(name, size, _intrinsics, row, inner)
         if lens is None:
             continue
         confidence = ConfidenceFile(levels[number]) if number in levels else None
@@ -123,12 +123,10 @@ def _pose(row: Mapping[str, str]) -> NDArray[np.float64]:
     return pose_from_quat(numbers(row, _POSE[3:]), numbers(row, _POSE[:3]))
 
 
-def _intrinsics(
-    row: Mapping[str, str], inner: Sequence[float] | None, size: tuple[int, int]
-) -> Sequence[float]:
+def _intrinsics(row: Mapping[str, str], inner: Sequence[float] | None) -> Sequence[float]:
     """Returns fx, fy, cx, cy of a frame: its own, else those of the last one."""
     if all(row.get(key) for key in _INNER):
-        return fit_intrinsics(numbers(row, _INNER), size, _ODOMETRY)[0]
+        return numbers(row, _INNER)
     if inner is None:
         raise KeyError("no intrinsics")
     return inner
