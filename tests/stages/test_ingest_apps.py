@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
-from app_sets import APPS, pack, relative, shots, stray
+from app_sets import APPS
+from app_shots import shots
 from ingest_media import take
+from phone_writers import pack, relative, stray
 from PIL import Image
 
 from recon_cli.config.stages import IngestConfig

@@ -4,7 +4,8 @@ import shutil
 
 import numpy as np
 import pytest
-from app_sets import APPS, shots
+from app_sets import APPS
+from app_shots import shots
 from ingest_media import take
 from sfm_inputs import run
 
