@@ -103,5 +103,11 @@ def levels(path, depth, high=2):
     Image.fromarray(values).save(path)
 
 
+def rotation(matrix):
+    """Returns the rotation of a pose, none of one that is not finite: its place says so."""
+    good = np.isfinite(matrix[:3, :3]).all()
+    return Rotation.from_matrix(matrix[:3, :3]) if good else Rotation.identity()
+
+
 def quat(matrix):
-    return Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()  # x y z w
+    return rotation(matrix).as_quat().tolist()  # x y z w

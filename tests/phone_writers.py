@@ -7,9 +7,8 @@ from fractions import Fraction
 import av
 import cv2
 import numpy as np
-from app_shots import ARKIT, GL, jpeg, levels, millimetres, quat
+from app_shots import ARKIT, GL, jpeg, levels, millimetres, quat, rotation
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 
 def polycam(folder, frames, corrected=True, sizes=True):
@@ -202,7 +201,7 @@ def arkit_scenes(folder, frames, inside="42444946_frames"):
         millimetres(home / "lowres_depth" / f"{stem}.png", frame.depth)
         levels(home / "confidence" / f"{stem}.png", frame.depth)
         w2c = np.linalg.inv(frame.c2w)
-        turn = Rotation.from_matrix(w2c[:3, :3]).as_rotvec()
+        turn = rotation(w2c).as_rotvec()
         rows.append(" ".join(f"{one:.9f}" for one in (frame.time, *turn, *w2c[:3, 3])))
     (home / "lowres_wide.traj").write_text("\n".join(rows) + "\n")
 

@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-from app_shots import GL, jpeg
+from app_shots import GL, jpeg, rotation
 from scipy.spatial.transform import Rotation
 
 
@@ -96,7 +96,7 @@ def opensfm(folder, frames, report=False):
             "focal_x": fx / longer, "focal_y": fy / longer, "c_x": (cx - width / 2) / longer,
             "c_y": (cy - height / 2) / longer,
             **dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)}
-        turn = Rotation.from_matrix(w2c[:3, :3]).as_rotvec().tolist()
+        turn = rotation(w2c).as_rotvec().tolist()
         shots_[f"o{frame.number}.jpg"] = {
             "rotation": turn, "camera": f"c{frame.number}",
             "translation": (frame.c2w if report else w2c)[:3, 3].tolist()}

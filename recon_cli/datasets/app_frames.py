@@ -114,12 +114,13 @@ def pose_from_quat(xyzw: Iterable[Any], position: Iterable[Any]) -> NDArray[np.f
 def tracked_set(
     layout: str, listed: Sequence[PosedImage], folder: Path, left_out: LeftOut, *,
     photos: str, up: tuple[float, float, float] | None = Y_UP,
-    missing: Sequence[str] = (),
+    missing: Sequence[str] = (), bare: int = 0,
 ) -> PosedSet:
     """Returns the frames that a phone or headset tracked, in metres.
 
-    `photos` are its pictures for a hint, below the folder. With `up` None, up is found from the
-    scene. InputError if no frame has an image and a pose, or all poses are one and the same.
+    `photos` are its pictures for a hint, below the folder; `bare` counts poses that have none. With
+    `up` None, up is found from the scene. InputError if no frame has an image and a pose, or all
+    poses are one and the same.
     """
     hint = ("Give the pictures alone, so that the cameras are found from them: recon ingest "
             f"{photos}")
@@ -131,7 +132,8 @@ def tracked_set(
     posed = find_images(layout, listed, folder, missing=missing)
     return replace(
         posed, metric=True, sequence=True, up=up, find_up=up is None, accuracy="tracked",
-        notices=(*left_out.notices(), *posed.notices))
+        notices=(*left_out.notices(), *posed.notices, *(
+            [f"without a picture: {bare} of its poses"] if bare else [])))
 
 
 def refuse_one_pose(listed: Sequence[PosedImage], folder: Path, hint: str) -> None:

@@ -81,7 +81,8 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
                           reliable=LIDAR_RANGE) if file else None
         listed.append(PosedImage(image.name, image, lens, viewmat, depth=depth, time=time))
     return tracked_set(
-        "arkitscenes", listed, folder, left_out, up=Z_UP, photos=quoted(home / kind))
+        "arkitscenes", listed, folder, left_out, up=Z_UP, photos=quoted(home / kind),
+        bare=sum(_nearest(images, time) is None for time in inner))
 
 
 def _by_time(folder: Path, suffixes: tuple[str, ...] = PICTURES) -> dict[float, Path]:

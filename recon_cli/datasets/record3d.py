@@ -83,7 +83,8 @@ def read_record3d(folder: Path) -> PosedSet:
             path.name, path, lens, viewmat, depth=_depth(place, path, lens, depth_size),
             time=_time(times, number)))
     posed = tracked_set(
-        "record3d", listed, folder, left_out, up=None, photos=quoted(place / name))
+        "record3d", listed, folder, left_out, up=None, photos=quoted(place / name),
+        bare=len(set(range(len(poses))) - set(images)))
     return posed
 
 

@@ -25,6 +25,7 @@ from recon_cli.datasets.app_frames import (
     PICTURES,
     Z_UP,
     LeftOut,
+    fit_intrinsics,
     pose_from_quat,
     quoted,
     tracked_set,
@@ -78,29 +79,31 @@ def read_rtabmap(folder: Path) -> PosedSet:
     InputError if there is none; FormatError if the poses have no time stamps or are damaged.
     """
     found = _find(folder)
-    left_out, listed = LeftOut(), list[PosedImage]()
+    left_out, listed, bare = LeftOut(), list[PosedImage](), 0
     for name, camera, path, base in found[:1] if found[0][3] else found:
-        listed += _list_camera(folder, name, camera, path, base, left_out)
+        images, unused = _list_camera(folder, name, camera, path, base, left_out)
+        listed += images
+        bare += unused
     notices = [f"its confidence has values up to {scale}, which are taken as certain" for scale in
                {image.depth.confidence.high for image in listed
                 if image.depth and image.depth.confidence}]
     posed = tracked_set(
-        "rtabmap", listed, folder, left_out, up=Z_UP,
+        "rtabmap", listed, folder, left_out, up=Z_UP, bare=bare,
         photos=quoted(_pictures(folder, found[0][0]) or folder))
     return replace(posed, accuracy="solved", notices=(*posed.notices, *notices))
 
 
 def _list_camera(
     folder: Path, name: str, camera: str, path: Path, base: bool, left_out: LeftOut
-) -> list[PosedImage]:
-    """Returns the images of one camera."""
+) -> tuple[list[PosedImage], int]:
+    """Returns the images of one camera, and how many poses have none."""
     place = _pictures(folder, name)
     assert place is not None
     by_time, by_id = _read_poses(path)
     levels = {file.stem: file for file in sorted((folder / f"{name}_confidence").glob("*.png"))}
     scale = _confidence_scale(list(levels.values()))
     several = camera or next(place.glob("*_0.*"), None)
-    listed = []
+    listed, shown = [], set[int]()
     for image in sorted(place.iterdir(), key=lambda one: _order(one.stem)):
         if image.suffix.lower() not in PICTURES:
             continue
@@ -115,6 +118,7 @@ def _list_camera(
         if pose is None:
             left_out.add(image.name, f"without a pose in {path.name}")
             continue
+        shown.add(id(pose))
         calibration = folder / f"{name}_calib" / f"{image.stem}.yaml"
         try:
             lens, local = _read_calibration(calibration)
@@ -131,7 +135,7 @@ def _list_camera(
             depth=DepthFile(depth, MILLIMETRE, lens, reliable=LIDAR_RANGE,
                             confidence=ConfidenceFile(level, scale) if level else None)
             if depth.is_file() else None))
-    return listed
+    return listed, len(by_time) - len(shown)
 
 
 def _confidence_scale(files: Sequence[Path]) -> int:
@@ -213,7 +217,10 @@ def _read_calibration(path: Path) -> tuple[Lens, NDArray[np.float64]]:
     if sizes[0] is None or sizes[1] is None or len(matrix) != 9:
         raise FormatError(f"{path} lacks image_width, image_height or camera_matrix.")
     width, height = int(sizes[0][1]), int(sizes[1][1])
-    inner = matrix[0], matrix[4], matrix[2], matrix[5]
+    inner, factor = fit_intrinsics(
+        (matrix[0], matrix[4], matrix[2], matrix[5]), (width, height), str(path))
+    if factor != 1:
+        raise FormatError(f"{path} has intrinsics for images of another size than it says.")
     lens = make_lens("PINHOLE", width, height, inner, str(path))
     local = _data(text, "local_transform")
     transform = np.eye(4)

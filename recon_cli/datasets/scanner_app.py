@@ -58,7 +58,8 @@ def read_scanner_app(folder: Path) -> PosedSet:
             listed.append(PosedImage(
                 path.name, path, image[0], image[1], depth=depth, time=image[2]))
     return tracked_set(
-        "3dscannerapp", listed, folder, left_out, photos=f"{quoted(folder)}/frame_*.jpg")
+        "3dscannerapp", listed, folder, left_out, photos=f"{quoted(folder)}/frame_*.jpg",
+        bare=len(set(texts) - set(images)))
 
 
 def _list_frame(path: Path, text: Path, left_out: LeftOut) -> Any:
