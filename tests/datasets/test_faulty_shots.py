@@ -164,14 +164,17 @@ def assert_right(posed, app, good):
             (params if len(params) > 3 else (params[0], *params))[:4], wanted, rtol=0.02)
 
 
-UNITS = {"metres": 1 / 1000, "centimetres": 1 / 10, "feet": 1 / 0.3048}
+OTHER_DEPTH = {
+    "metres": lambda depth: depth / 1000, "centimetres": lambda depth: depth / 10,
+    "feet": lambda depth: depth * 0.3048, "upside down": lambda depth: depth[::-1],
+    "mirrored": lambda depth: depth[:, ::-1]}
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("kind", OTHER_DEPTH)
 @pytest.mark.parametrize("name", [name for name, app in APPS.items() if app.depth])
-def test_depth_in_another_unit_is_not_used(name, unit, frames, tmp_path):
-    taken = change(frames, range(COUNT), depth=lambda shot: shot.depth * UNITS[unit])
+def test_depth_in_another_unit_or_order_is_not_used(name, kind, frames, tmp_path):
+    taken = change(frames, range(COUNT), depth=lambda shot: OTHER_DEPTH[kind](shot.depth))
     APPS[name].write(tmp_path / "capture", taken)
     summary = take(tmp_path / "capture", tmp_path / "out")
     assert summary.kind == APPS[name].name
