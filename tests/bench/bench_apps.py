@@ -129,7 +129,7 @@ def main(data: Path, room: str, count: int, step: int, layouts: tuple[str, ...],
                 print_row(name, "drift" if tracked else "exact", done.error)
                 continue
             row = score(workspace, taken, app.metric)
-            error = row["scale_error"]
+            error = row.get("scale_error")  # none of an arbitrary scale
             print_row(
                 name, "drift" if tracked else "exact", f"{row['frames']} of {row['of']}",
                 f"{row['scale']:+.2%}" if row["metres"] else row["scale_source"],
