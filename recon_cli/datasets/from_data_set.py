@@ -215,8 +215,7 @@ def _write_depth(
     fault = find_fault([image for _, image in readable if not image.held_out]) if (
         _has_lidar(posed)) else ""
     if fault:
-        ctx.notice(f"The depth is not used: it fits the poses {fault}, so its files are not what "
-                   "its program writes.")
+        ctx.notice(f"The depth is not used: it would fit the poses {fault}, but not as it is.")
         return _without_depth(posed)
     maps, damaged, medians = {}, dict[str, FormatError](), []
     for name, image in readable:
