@@ -278,7 +278,7 @@ def quest(folder, frames, baseline=0.06, eyes=("left", "right")):
             rgba = np.dstack([frame.rgb, np.full(frame.rgb.shape[:2], 255, np.uint8)])
             (home / f"{stamp}.rgba").write_bytes(np.ascontiguousarray(rgba[::-1]).tobytes())
             good = "true" if frame.number != 1 or eye == "left" else "false"
-            values = [frame.number, f"{stamp}.rgba", 0, stamp, width, height, "RGBA32", eye,
-                      *unity[:3, 3], *quat(unity), good, "true", "true", ""]
+            values = [frame.number, f"{stamp}.rgba", stamp // 1000, stamp, width, height,
+                      "RGBA32", eye, *unity[:3, 3], *quat(unity), good, "true", "true", ""]
             lines.append(",".join(map(str, values)))
         (folder / f"{eye}_camera_mruk_frame_metadata.csv").write_text("\n".join(lines) + "\n")

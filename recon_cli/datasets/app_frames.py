@@ -111,6 +111,15 @@ def pose_from_quat(xyzw: Iterable[Any], position: Iterable[Any]) -> NDArray[np.f
     return pose
 
 
+def pose_from_unity(xyzw: Iterable[Any], position: Iterable[Any]) -> NDArray[np.float64]:
+    """Returns [4, 4] camera to world, OpenCV's axes, y up, of Unity's left-handed world and camera.
+
+    ValueError as for `pose_from_quat`.
+    """
+    world, camera = np.diag([1.0, 1, -1, 1]), np.diag([1.0, -1, 1, 1])
+    return np.asarray(world @ pose_from_quat(xyzw, position) @ camera)
+
+
 def tracked_set(
     layout: str, listed: Sequence[PosedImage], folder: Path, left_out: LeftOut, *,
     photos: str, up: tuple[float, float, float] | None = Y_UP,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +36,12 @@ _ORDERS: dict[str, Turn] = {
     "with left and right swapped": lambda depth: depth[:, ::-1]}
 
 
+Item = TypeVar("Item")
+
+
 @dataclass(frozen=True, eq=False)
-class _View:
-    """Depth at the samples of an image, and where it is."""
+class View:
+    """Depth, not all of it 0, and the camera that it is of."""
 
     depth: NDArray[np.float32]  # [h, w] as it is read
     lens: Lens  # of the depth
@@ -60,22 +64,34 @@ def find_fault(images: Sequence[PosedImage]) -> str:
     return words or f"with values about {scale:.2g} times as large"
 
 
-def _choose_pairs(images: Sequence[PosedImage]) -> list[tuple[_View, _View]]:
+def compare_views(views: Sequence[View]) -> float:
+    """Returns how far depth from different places is apart, relatively, as a median."""
+    pairs = _pair_up(list(views), [view.viewmat for view in views], lambda view: view)
+    return _error(pairs, 1.0, _ORDERS[""]) if pairs else np.inf
+
+
+def _choose_pairs(images: Sequence[PosedImage]) -> list[tuple[View, View]]:
     """Returns pairs of images with depth that see the same from different places."""
     with_depth = [image for image in images if image.depth is not None]
-    starts = sorted({int(at) for at in np.linspace(0, len(with_depth) - 1, 2 * _PAIRS)}) if (
-        len(with_depth) > 1) else []
-    pairs: list[tuple[_View, _View]] = []
+    return _pair_up(with_depth, [image.viewmat for image in with_depth], _read)
+
+
+def _pair_up(
+    items: Sequence[Item], viewmats: Sequence[NDArray[np.float64]],
+    read: Callable[[Item], View | None],
+) -> list[tuple[View, View]]:
+    last = len(items) - 1
+    starts = sorted({int(at) for at in np.linspace(0, last, 2 * _PAIRS)}) if last > 0 else []
+    pairs: list[tuple[View, View]] = []
     for start in starts:
-        one = _read(with_depth[start])
+        one = read(items[start])
         if one is None or len(pairs) == _PAIRS:
             continue
         typical = float(np.median(one.depth[one.depth > 0]))
-        last = len(with_depth) - 1
-        for at in sorted({int(at) for at in np.geomspace(1, max(last - start, 1), _TRIES)}):
-            other = with_depth[min(start + at, last)]
-            if _sees_alike(one.viewmat, other.viewmat, typical):
-                view = _read(other)
+        for step in sorted({int(at) for at in np.geomspace(1, max(last - start, 1), _TRIES)}):
+            at = min(start + step, last)
+            if _sees_alike(one.viewmat, viewmats[at], typical):
+                view = read(items[at])
                 if view is not None:
                     pairs.append((one, view))
                 break
@@ -93,7 +109,7 @@ def _sees_alike(one: NDArray[np.float64], other: NDArray[np.float64], depth: flo
     return bool(turned <= _MOST_TURNED_DEG and moved >= _LEAST_MOVED * min(depth, 2.0))
 
 
-def _read(image: PosedImage) -> _View | None:
+def _read(image: PosedImage) -> View | None:
     """Returns the depth of an image where it is certain; None where it is damaged or empty."""
     assert image.depth is not None
     try:
@@ -104,17 +120,17 @@ def _read(image: PosedImage) -> _View | None:
         depth[levels == 0] = 0
     if not depth.any():
         return None
-    return _View(depth, image.depth.own_lens(*depth.shape[::-1]), image.viewmat)
+    return View(depth, image.depth.own_lens(*depth.shape[::-1]), image.viewmat)
 
 
-def _error(pairs: Sequence[tuple[_View, _View]], scale: float, turn: Turn) -> float:
+def _error(pairs: Sequence[tuple[View, View]], scale: float, turn: Turn) -> float:
     """Returns the median error over pairs; infinite where too little is seen by both."""
     found = [_compare(one, other, scale, turn) for one, other in pairs]
     known = [error for error in found if np.isfinite(error)]
     return float(np.median(known)) if len(known) >= max(1, len(pairs) // 2) else np.inf
 
 
-def _compare(one: _View, other: _View, scale: float, turn: Turn) -> float:
+def _compare(one: View, other: View, scale: float, turn: Turn) -> float:
     """Returns the median relative error of depth that one image predicts for another."""
     depth, there = turn(one.depth), turn(other.depth)
     height, width = depth.shape

@@ -6,6 +6,7 @@ import math
 import struct
 import warnings
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -62,6 +63,7 @@ class DepthFile:
     reliable: float = math.inf  # world units; what is farther is a guess
     # (height, width) of a file that does not say it; None: as many of the image's shape as it has
     shape: tuple[int, int] | None = None
+    make: Callable[[], NDArray[np.float32]] | None = None  # reads files that this module does not
 
     def __call__(self) -> NDArray[np.float32]:
         """Returns [H, W] z-depth at the size of the image, in world units, 0 where unknown.
@@ -88,6 +90,8 @@ class DepthFile:
 
         FormatError if the file is missing, damaged or no depth.
         """
+        if self.make is not None:
+            return self.make()
         shape = self.shape
         if shape is None and self.path.suffix.lower() in _PACKED:
             shape = _shape_like(self.path, self.lens)
