@@ -110,7 +110,8 @@ class SfmConfig(StageConfig):
         unit="share",
         minimum=0.0, maximum=1.0)
     accept_weak: bool = option(
-        False, "Continue even if parts of the model are weakly connected.", hashed=False)
+        False, "Continue even if parts of the model are weakly connected, or sources of the scale "
+        "contradict each other.", hashed=False)
     partial: bool = option(
         True, "Cut a broken model, and keep the parts that can be trusted on their own.",
         hashed=False)

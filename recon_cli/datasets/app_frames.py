@@ -6,6 +6,7 @@ counted by reason; a set without any frame that can be used is refused.
 
 from __future__ import annotations
 
+import csv
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -26,9 +27,12 @@ MILLIMETRE = 1e-3
 Y_UP = (0.0, 1.0, 0.0)  # of ARKit's and Unity's worlds
 Z_UP = (0.0, 0.0, 1.0)
 PICTURES = (".jpg", ".jpeg", ".png")
+HEAD_LINES = 3  # of a table, one of which is the header
 _UNIT_LENGTH = 1e-2  # by which a quaternion of decimals may miss the length of 1
-_OFF_CENTRE = 0.2  # of the image's side; beyond it a principal point is that of another size
+_OFF_CENTRE = 0.2  # of the image's side, by which a principal point may miss the middle
 _RATIOS = sorted({a / b for a in range(1, 9) for b in range(1, 9)})  # of resized images
+# Nearer to 1, a principal point that is off by one ratio along both sides may be a lens'.
+_LEAST_RATIO = 1.25
 _RATIO_SLACK = 0.06  # by which a principal point may miss the middle, as a share
 _MOVED = 1e-9  # poses that differ by less are one and the same
 
@@ -38,6 +42,7 @@ class LeftOut:
 
     def __init__(self) -> None:
         self._names: dict[str, list[str]] = {}
+        self._scaled: dict[float, list[str]] = {}
 
     def add(self, name: str, reason: str) -> None:
         """Adds a frame; `reason` goes on after "frames"."""
@@ -49,10 +54,13 @@ class LeftOut:
         return sum(map(len, self._names.values()))
 
     def notices(self) -> tuple[str, ...]:
-        """Returns one notice for each reason."""
+        """Returns one notice for each reason, and for each factor of intrinsics."""
         return tuple(
             f"left out: {format_count(len(names), 'frame')} {reason}, the first is {names[0]}"
-            for reason, names in self._names.items())
+            for reason, names in self._names.items()) + tuple(
+            f"the intrinsics of {format_count(len(names), 'frame')} were scaled by {factor:.4g}: "
+            f"they are for images of another size, the first is {names[0]}"
+            for factor, names in self._scaled.items())
 
     def pose(
         self, name: str, make: Callable[..., Any], *values: Any, opengl: bool
@@ -67,13 +75,20 @@ class LeftOut:
     def lens(
         self, name: str, size: tuple[int, int], make: Callable[..., Sequence[Any]], *values: Any
     ) -> Lens | None:
-        """Returns a PINHOLE of fx, fy, cx, cy by `make(*values)`, None where unusable."""
+        """Returns a PINHOLE of fx, fy, cx, cy by `make(*values)`, None where unusable.
+
+        Intrinsics of images of another size are scaled, and counted.
+        """
         try:
-            params = [float(one) for one in make(*values)]
-            return make_lens("PINHOLE", *size, params, name)
+            params, factor = fit_intrinsics(make(*values), size, name)
+            found = make_lens("PINHOLE", *size, params, name)
         except (FormatError, KeyError, TypeError, ValueError, IndexError, OverflowError):
-            self.add(name, "whose intrinsics are missing or not those of a camera")
+            self.add(name, f"whose intrinsics are missing or not those of {size[0]}x{size[1]} "
+                     "pixels")
             return None
+        if factor != 1:
+            self._scaled.setdefault(factor, []).append(name)
+        return found
 
     def json(self, path: Path) -> dict[str, Any] | None:
         """Returns the object in a frame's file, None where it is cut short or damaged."""
@@ -96,15 +111,25 @@ def pose_from_quat(xyzw: Iterable[Any], position: Iterable[Any]) -> NDArray[np.f
     return pose
 
 
+def pose_from_unity(xyzw: Iterable[Any], position: Iterable[Any]) -> NDArray[np.float64]:
+    """Returns [4, 4] camera to world, OpenCV's axes, y up, of Unity's left-handed world and camera.
+
+    ValueError as for `pose_from_quat`.
+    """
+    world, camera = np.diag([1.0, 1, -1, 1]), np.diag([1.0, -1, 1, 1])
+    return np.asarray(world @ pose_from_quat(xyzw, position) @ camera)
+
+
 def tracked_set(
     layout: str, listed: Sequence[PosedImage], folder: Path, left_out: LeftOut, *,
     photos: str, up: tuple[float, float, float] | None = Y_UP,
-    missing: Sequence[str] = (),
+    missing: Sequence[str] = (), bare: int = 0,
 ) -> PosedSet:
     """Returns the frames that a phone or headset tracked, in metres.
 
-    `photos` are its pictures for a hint, below the folder. With `up` None, up is found from the
-    scene. InputError if no frame has an image and a pose, or all poses are one and the same.
+    `photos` are its pictures for a hint, below the folder; `bare` counts poses that have none. With
+    `up` None, up is found from the scene. InputError if no frame has an image and a pose, or all
+    poses are one and the same.
     """
     hint = ("Give the pictures alone, so that the cameras are found from them: recon ingest "
             f"{photos}")
@@ -116,7 +141,8 @@ def tracked_set(
     posed = find_images(layout, listed, folder, missing=missing)
     return replace(
         posed, metric=True, sequence=True, up=up, find_up=up is None, accuracy="tracked",
-        notices=(*left_out.notices(), *posed.notices))
+        notices=(*left_out.notices(), *posed.notices, *(
+            [f"without a picture: {bare} of its poses"] if bare else [])))
 
 
 def refuse_one_pose(listed: Sequence[PosedImage], folder: Path, hint: str) -> None:
@@ -154,24 +180,30 @@ def list_numbered(
 def read_csv(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
     """Returns the rows of a table with a header, by its names in small letters.
 
-    A last line that is cut short is left out. FormatError if a needed column is missing.
+    Comments may stand above the header. A line that is cut short lacks its last columns.
+    FormatError if a needed column is missing.
     """
     try:
         lines = [line for line in read_text(path).lstrip("\ufeff").splitlines() if line.strip()]
-    except (OSError, ValueError) as error:
+        table = [[value.strip() for value in row]
+                 for row in csv.reader(lines, skipinitialspace=True)]
+    except (OSError, ValueError, csv.Error) as error:
         raise FormatError(
             f"{path} cannot be read: {error}.", hint="Copy the file again.") from error
-    head = lines[0].split(",") if lines else []
-    names = [name.strip().lstrip("#").strip().lower() for name in head]
-    if missing := [name for name in needed if name not in names]:
+    heads = [column_names(row) for row in table[:HEAD_LINES]]
+    at = next((at for at, names in enumerate(heads) if set(needed) <= set(names)), None)
+    if at is None:
+        names = heads[0] if heads else []
+        missing = [name for name in needed if name not in names]
         raise FormatError(
             f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(names) or 'none'}.",
             hint="Copy the file again, or export it again.")
-    rows = []
-    for line in lines[1:]:
-        values = [value.strip() for value in line.split(",")]
-        rows.append(dict(zip(names, values, strict=False)))
-    return rows
+    return [dict(zip(heads[at], row, strict=False)) for row in table[at + 1:]]
+
+
+def column_names(row: Sequence[str]) -> list[str]:
+    """Returns the names of the columns of a header, in small letters and without its mark."""
+    return [name.strip().lstrip("#").strip().lower() for name in row]
 
 
 def numbers(row: Mapping[str, str], names: Sequence[str]) -> list[float]:
@@ -184,21 +216,21 @@ def fit_intrinsics(
 ) -> tuple[tuple[float, float, float, float], float]:
     """Returns fx, fy, cx, cy for images of a size, and by which factor they were scaled.
 
-    For intrinsics that do not say their size: if the principal point lies off the middle by one
-    simple factor along both sides, they are those of a larger or smaller image. FormatError if
-    they are those of no such size.
+    If the principal point lies off the middle by one simple factor along both sides, they are those
+    of a larger or smaller image. FormatError if they are those of no such size.
     """
     fx, fy, cx, cy = map(float, params)
     width, height = size
     if not all(np.isfinite([fx, fy, cx, cy])) or min(fx, fy, cx, cy) <= 0:
         raise FormatError(f"{where} holds no intrinsics of a camera: {fx:g} {fy:g} {cx:g} {cy:g}.")
-    if abs(cx / width - 0.5) <= _OFF_CENTRE and abs(cy / height - 0.5) <= _OFF_CENTRE:
-        return (fx, fy, cx, cy), 1.0
     across, down = width / (2 * cx), height / (2 * cy)
     ratio = min(_RATIOS, key=lambda one: abs(np.log(one / np.sqrt(across * down))))
-    if max(abs(across / ratio - 1), abs(down / ratio - 1)) > _RATIO_SLACK:
+    fits = max(abs(across / ratio - 1), abs(down / ratio - 1)) <= _RATIO_SLACK
+    if fits and max(ratio, 1 / ratio) >= _LEAST_RATIO:
+        return (fx * ratio, fy * ratio, cx * ratio, cy * ratio), float(ratio)
+    if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _OFF_CENTRE:
         raise FormatError(
             f"{where} has the principal point {cx:.0f}, {cy:.0f}, but the images have "
             f"{width}x{height} pixels: it is that of images of another shape.",
             hint="Export images and intrinsics at one size.")
-    return (fx * ratio, fy * ratio, cx * ratio, cy * ratio), float(ratio)
+    return (fx, fy, cx, cy), 1.0

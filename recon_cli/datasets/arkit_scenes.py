@@ -27,7 +27,7 @@ from recon_cli.datasets.app_frames import (
 from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError, InputError
-from recon_cli.scene.camera import Lens, make_lens
+from recon_cli.scene.camera import Lens
 
 _KINDS = ("wide", "vga_wide", "lowres_wide")  # the largest pictures first
 _TRAJ = "lowres_wide.traj"
@@ -56,7 +56,8 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
     """
     home = _home(folder)
     assert home is not None
-    kind = next((kind for kind in _KINDS if _by_time(home / kind)), _KINDS[-1])
+    kind = next((kind for kind in _KINDS if _by_time(home / kind) and _by_time(
+        home / f"{kind}_intrinsics", (".pincam",))), _KINDS[-1])
     images = _by_time(home / kind)
     inner = _by_time(home / f"{kind}_intrinsics", (".pincam",))
     depths, levels = _by_time(home / "lowres_depth"), _by_time(home / "confidence")
@@ -80,7 +81,8 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
                           reliable=LIDAR_RANGE) if file else None
         listed.append(PosedImage(image.name, image, lens, viewmat, depth=depth, time=time))
     return tracked_set(
-        "arkitscenes", listed, folder, left_out, up=Z_UP, photos=quoted(home / kind))
+        "arkitscenes", listed, folder, left_out, up=Z_UP, photos=quoted(home / kind),
+        bare=sum(_nearest(images, time) is None for time in inner))
 
 
 def _by_time(folder: Path, suffixes: tuple[str, ...] = PICTURES) -> dict[float, Path]:
@@ -106,11 +108,12 @@ def _nearest(files: Mapping[float, Path], time: float) -> Path | None:
 def _read_lens(text: Path, image: Path, left_out: LeftOut) -> Lens | None:
     try:
         width, height, *inner = map(float, text.read_text(encoding="utf-8").split())
+        size = round(width), round(height)
         image_size(image)
-        return make_lens("PINHOLE", width, height, inner, str(text))
-    except (OSError, ValueError, FormatError):
+    except (OSError, ValueError, OverflowError, FormatError):
         left_out.add(image.name, "whose .pincam or picture cannot be read")
         return None
+    return left_out.lens(image.name, size, tuple, inner)
 
 
 class _Trajectory:

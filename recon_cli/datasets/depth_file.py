@@ -6,6 +6,7 @@ import math
 import struct
 import warnings
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -60,7 +61,9 @@ class DepthFile:
     unknown: float = math.inf  # the value of the file that means unknown, as 0 does
     confidence: ConfidenceFile | None = None  # of each value; None where the data set has none
     reliable: float = math.inf  # world units; what is farther is a guess
-    shape: tuple[int, int] | None = None  # (height, width) of a file that does not say it
+    # (height, width) of a file that does not say it; None: as many of the image's shape as it has
+    shape: tuple[int, int] | None = None
+    make: Callable[[], NDArray[np.float32]] | None = None  # reads files that this module does not
 
     def __call__(self) -> NDArray[np.float32]:
         """Returns [H, W] z-depth at the size of the image, in world units, 0 where unknown.
@@ -87,7 +90,12 @@ class DepthFile:
 
         FormatError if the file is missing, damaged or no depth.
         """
-        stored = _read(self.path, np.dtype("<f4"), self.shape).astype(np.float64)
+        if self.make is not None:
+            return self.make()
+        shape = self.shape
+        if shape is None and self.path.suffix.lower() in _PACKED:
+            shape = _shape_like(self.path, self.lens)
+        stored = _read(self.path, np.dtype("<f4"), shape).astype(np.float64)
         stored[~np.isfinite(stored)] = 0
         values = np.where(stored == self.unknown, 0, stored) * self.unit
         return np.where((values > 0) & (values < _MAX_DEPTH), values, 0).astype(np.float32)
@@ -140,6 +148,21 @@ def _read(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, int] | None
             f"{path} is not a depth image: it holds {values.dtype} of shape {values.shape}, "
             "needed one value a pixel.", hint=_HINT)
     return values
+
+
+def _shape_like(path: Path, lens: Lens) -> tuple[int, int]:
+    """Returns (height, width) of a packed file of float32 that has the shape of its image."""
+    try:
+        count = lzfse_stream.decoded_size(path.read_bytes()) / 4
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path} cannot be read as depth: {error}.", hint=_HINT) from error
+    width = round(math.sqrt(count * lens.width / lens.height))
+    height = round(count / max(width, 1))
+    if width * height != count or abs(width * lens.height - height * lens.width) > max(
+            lens.width, lens.height):
+        raise FormatError(
+            f"{path} holds {count:g} values, and nothing says in how many rows.", hint=_HINT)
+    return height, width
 
 
 def _nearest_pixels(

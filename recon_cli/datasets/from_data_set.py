@@ -26,6 +26,7 @@ from recon_cli.capture.photo_tree import describe_unused
 from recon_cli.capture.photos import make_frame_names
 from recon_cli.capture.video import stored_frames
 from recon_cli.config.stages import IngestConfig
+from recon_cli.datasets.depth_agreement import find_fault
 from recon_cli.datasets.depth_points import points_from_depth
 from recon_cli.datasets.layouts import describe, read_posed
 from recon_cli.datasets.packed import is_packed, unpacked
@@ -211,6 +212,11 @@ def _write_depth(
     Returns the set without depth that is damaged, or that cannot be that of a room, which a notice
     counts. FormatError if every file is damaged.
     """
+    fault = find_fault([image for _, image in readable if not image.held_out]) if (
+        _has_lidar(posed)) else ""
+    if fault:
+        ctx.notice(f"The depth is not used: it would fit the poses {fault}, but not as it is.")
+        return _without_depth(posed)
     maps, damaged, medians = {}, dict[str, FormatError](), []
     for name, image in readable:
         if image.depth is None or image.held_out:
@@ -234,7 +240,7 @@ def _write_depth(
         ctx.notice(
             f"The depth is not used: it is {typical:.3g} m in the median of the frames, which is "
             "not that of a room, so its unit is not the one that its program writes.")
-        return replace(posed, images=tuple(replace(image, depth=None) for image in posed.images))
+        return _without_depth(posed)
     if damaged:
         first = next(iter(damaged.values()))
         ctx.notice(f"Depth is left out: {format_count(len(damaged), 'file')} cannot be read; "
@@ -243,6 +249,10 @@ def _write_depth(
         write_depth_list(out, maps)
     return replace(posed, images=tuple(
         replace(image, depth=None) if image.name in damaged else image for image in posed.images))
+
+
+def _without_depth(posed: PosedSet) -> PosedSet:
+    return replace(posed, images=tuple(replace(image, depth=None) for image in posed.images))
 
 
 def _has_lidar(posed: PosedSet) -> bool:

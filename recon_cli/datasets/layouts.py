@@ -13,6 +13,7 @@ from recon_cli.capture.mask_files import mask_folders, match_masks
 from recon_cli.datasets.arkit_scenes import is_arkit_scenes, read_arkit_scenes
 from recon_cli.datasets.bundler import is_bundler, read_bundler
 from recon_cli.datasets.colmap import is_colmap, lacks_cameras, read_colmap
+from recon_cli.datasets.incomplete import find_incomplete
 from recon_cli.datasets.kinect import (
     find_unposed,
     is_seven_scenes,
@@ -119,6 +120,11 @@ def refuse_incomplete(path: Path) -> None:
         lacks, images = "Replica frames without traj.txt", path / "results" / "frame*"
     elif unposed := find_unposed(path):
         lacks, images = unposed
+    elif incomplete := find_incomplete(path):
+        lacks, pictures = incomplete
+        if not pictures:
+            raise FormatError(f"{path} holds {lacks}.", hint="Copy the capture again, all of it.")
+        images = pictures[0]
     else:
         return
     raise FormatError(

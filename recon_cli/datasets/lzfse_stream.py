@@ -15,7 +15,7 @@ _WORDS = struct.Struct("<II")
 
 def decompress(data: bytes, size: int) -> bytes:
     """Returns the decoded bytes, `size` of them; ValueError if there are others or damaged ones."""
-    found = _decoded_size(data)
+    found = decoded_size(data)
     if found != size:
         raise ValueError(f"it holds {found} bytes, needed {size}")
     import lzfse
@@ -29,7 +29,7 @@ def decompress(data: bytes, size: int) -> bytes:
     return decoded
 
 
-def _decoded_size(data: bytes) -> int:
+def decoded_size(data: bytes) -> int:
     """Returns the bytes that the blocks of a stream say they hold; ValueError if it is cut."""
     at, total = 0, 0
     while data[at:at + 4] != _END:

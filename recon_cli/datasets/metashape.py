@@ -9,6 +9,7 @@ nerfstudio's issue 2294.)
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -73,15 +74,17 @@ def read_metashape(path: Path) -> PosedSet:
         _Camera(node.get("label", ""), node.get("sensor_id", ""), node.get("component_id"),
                 node.findtext("transform"), f"{file}, camera {node.get('label')}")
         for node in chunk.iterfind("cameras//camera")]
-    worlds = {node.get("id"): _component(node, file)
-              for node in chunk.iterfind("components/component")}
+    worlds = _read_worlds(chunk, file)
     sensors = {node.get("id", ""): node for node in chunk.iterfind("sensors/sensor")}
     left_out, listed, missing = LeftOut(), [], []
     files = list_files(folder, [camera.label for camera in cameras])
+    apart = _unplaced_components(chunk, cameras)
     for camera in cameras:
         image = files.get(camera.label)
         if camera.transform is None:
             left_out.add(camera.label, "without a transform: not aligned, or second of a rig")
+        elif camera.component in apart:
+            left_out.add(camera.label, "of further components, which nothing places in one world")
         elif image is None:
             missing.append(camera.label)
         elif (viewmat := left_out.pose(
@@ -122,6 +125,25 @@ def _read_chunk(file: Path) -> ElementTree.Element:
     return chunk
 
 
+def _read_worlds(chunk: ElementTree.Element, file: Path) -> dict[str | None, Similarity]:
+    """Returns what takes each component to the world; old files have one for the whole chunk."""
+    common = _component(chunk, file)
+    return {node.get("id"): _component(node, file) if node.find("transform") is not None else common
+            for node in chunk.iterfind("components/component")} or {None: common}
+
+
+def _unplaced_components(
+    chunk: ElementTree.Element, cameras: Sequence[_Camera]
+) -> set[str | None]:
+    """Returns all components but the largest, if one of them has no transform to the world."""
+    counts = Counter(camera.component for camera in cameras if camera.transform is not None)
+    placed = {node.get("id") for node in chunk.iterfind("components/component")
+              if node.find("transform") is not None}
+    if len(counts) < 2 or set(counts) <= placed:
+        return set()
+    return set(counts) - {counts.most_common(1)[0][0]}
+
+
 def _numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
     try:
         values = np.array((text or "").split(), np.float64)
@@ -137,7 +159,7 @@ def _component(node: ElementTree.Element, file: Path) -> Similarity:
     found = node.find("transform")
     if found is None:
         return Similarity()
-    where = f"{file}, the transform of component {node.get('id')},"
+    where = f"{file}, the transform of {node.tag} {node.get('id', '')},"
     rotation, shift, scale = (found.findtext(key) for key in ("rotation", "translation", "scale"))
     matrix = np.eye(3) if rotation is None else _numbers(rotation, 9, where).reshape(3, 3)
     left, _, right = np.linalg.svd(matrix)

@@ -9,6 +9,7 @@ nerfstudio's polycam_utils.) raw.glb lies in another frame and is not read.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,9 @@ from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 
-_RIM = 15  # pixels along the border of undistorted images that may be black, as nerfstudio crops
+# Pixels along the border of undistorted images that may be black, as nerfstudio crops them of
+# pictures of 1024x768; of smaller ones by share.
+_RIM, _RIM_SHARE = 15, 0.02
 _HIGH = 255  # in the files of confidence
 
 
@@ -66,7 +69,7 @@ def read_polycam(folder: Path) -> PosedSet:
         confidence = ConfidenceFile(levels[number], _HIGH) if number in levels else None
         depth = DepthFile(depths[number], MILLIMETRE, image.lens, confidence=confidence,
                           reliable=LIDAR_RANGE) if number in depths else None
-        listed.append(replace(image, depth=depth, rim=_RIM if kind else 0))
+        listed.append(replace(image, depth=depth, rim=_rim(image) if kind else 0))
     posed = tracked_set(
         "polycam", listed, folder, left_out, missing=missing,
         photos=quoted(place / f"{kind}images"))
@@ -75,6 +78,10 @@ def read_polycam(folder: Path) -> PosedSet:
     return replace(posed, notices=(*posed.notices, (
         "it has no corrected cameras (loop closure was off, or the capture too long): the poses "
         "drift, and the lens distortion is written nowhere")))
+
+
+def _rim(image: PosedImage) -> int:
+    return min(_RIM, math.ceil(_RIM_SHARE * min(image.lens.width, image.lens.height)))
 
 
 def _list_keyframe(path: Path, camera: Path, left_out: LeftOut) -> PosedImage | None:
@@ -93,10 +100,7 @@ def _list_keyframe(path: Path, camera: Path, left_out: LeftOut) -> PosedImage | 
     lens = left_out.lens(path.name, size, _intrinsics, value)
     if lens is None:
         return None
-    blur = value.get("blur_score")
-    return PosedImage(
-        path.name, path, lens, viewmat, time=int(path.stem) / 1e6,
-        blur=float(blur) if isinstance(blur, (int, float)) else None)
+    return PosedImage(path.name, path, lens, viewmat, time=int(path.stem) / 1e6)
 
 
 def _pose(value: dict[str, Any]) -> list[list[float]]:

@@ -41,9 +41,9 @@ class PosedImage:
     mask: Path | None = None  # file of a mask, None without mask
     frame: int | None = None  # number of the frame in the video `path`, from 0
     time: float | None = None  # seconds, on the clock of the capture
+    clock_ms: float | None = None  # milliseconds on the clock of the device, where depth has it
     read: Callable[[], NDArray[np.uint8]] | None = None  # returns RGB [H, W, 3] of other files
     rim: int = 0  # pixels along the border that may be black and are masked
-    blur: float | None = None  # by the app; more is blurrier, and only within one set
 
     @property
     def is_picture(self) -> bool:

@@ -3,8 +3,7 @@
 session_info.json names the backend. {left,right}_camera_mruk_rgba/<us>.rgba hold R G B A, bottom
 row first; _intrinsics.json the lens, and _frame_metadata.csv a pose for each file in Unity's axes
 (left-handed, y up, metres, camera to world). Rows whose pose, texture or colours failed are left
-out. (t-34400/QuestRealityCapture: MrukCameraRecorder.cs.) The rows of its depth are not documented,
-so depth is not read.
+out. (t-34400/QuestRealityCapture: MrukCameraRecorder.cs.)
 """
 
 from __future__ import annotations
@@ -20,21 +19,23 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.app_frames import (
     LeftOut,
+    fit_intrinsics,
     numbers,
-    pose_from_quat,
+    pose_from_unity,
     quoted,
     read_csv,
     tracked_set,
 )
 from recon_cli.datasets.posed import PosedImage, PosedSet, is_file, resolve_inside
-from recon_cli.errors import FormatError, InputError
+from recon_cli.datasets.quest_depth import depth_of_photo, find_order, list_depth
+from recon_cli.errors import FormatError, InputError, format_count
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace.atomic import read_json
 
 _EYES = ("left", "right")
 _OK = ("pose_ok", "get_texture_ok", "get_colors_ok")
 _POSITION, _TURN = "pose_pos_{}", "pose_rot_{}"
-_UNITY_WORLD, _UNITY_CAMERA = np.diag([1.0, 1, -1, 1]), np.diag([1.0, -1, 1, 1])
+_ASKED = 60  # frames that the order of depth is found from
 _HINT = "Copy the recording from the headset again."
 
 
@@ -55,10 +56,27 @@ def read_quest(folder: Path) -> PosedSet:
     posed = tracked_set(
         "quest", listed, folder, left_out,
         photos=f"{quoted(folder)}, once its .rgba files are converted to pictures")
-    depth = any(next((folder / f"{eye}_depth").glob("*.raw"), None) for eye in _EYES
-                if (folder / f"{eye}_depth").is_dir())
-    return replace(posed, notices=(*posed.notices, *(
-        ["its depth is not read: the order of its rows is not documented"] * depth)))
+    return _add_depth(posed, folder)
+
+
+def _add_depth(posed: PosedSet, folder: Path) -> PosedSet:
+    """Returns the set with depth, where the order of its rows shows, and notices."""
+    if not any(folder.glob("*_depth/*.raw")):
+        return posed
+    left_out, images = LeftOut(), list(posed.images)
+    for eye in _EYES:
+        frames = list_depth(folder, eye, left_out)
+        order = find_order(frames[::max(1, len(frames) // _ASKED)])
+        if order is not None:
+            images = [replace(image, depth=depth_of_photo(
+                frames, order, image.clock_ms, image.lens, image.viewmat))
+                if image.clock_ms is not None and image.name.endswith(f"_{eye}.rgba") else image
+                for image in images]
+    unread = sum(image.depth is None for image in images)
+    return replace(posed, images=tuple(images), notices=(
+        *posed.notices, *left_out.notices(), *([
+            f"depth is not read of {format_count(unread, 'frame')}: none is near in time, or the "
+            "order of its rows, which is not documented, does not show in it"] if unread else [])))
 
 
 def _list_eye(folder: Path, eye: str, left_out: LeftOut) -> list[PosedImage]:
@@ -86,6 +104,7 @@ def _list_eye(folder: Path, eye: str, left_out: LeftOut) -> list[PosedImage]:
         if viewmat is not None:
             listed.append(PosedImage(
                 f"{path.stem}_{eye}.rgba", path, own, viewmat, time=_time(row),
+                clock_ms=_number(row, "unix_time_ms"),
                 read=functools.partial(read_rgba, path, own.width, own.height)))
     return listed
 
@@ -101,9 +120,7 @@ def _find_file(home: Path, name: str, table: Path) -> Path | None:
 
 
 def _pose(row: Mapping[str, str], columns: tuple[list[str], list[str]]) -> NDArray[np.float64]:
-    """Returns camera to world, OpenCV's camera axes, in a right-handed world with y up."""
-    unity = pose_from_quat(numbers(row, columns[1]), numbers(row, columns[0]))
-    return _UNITY_WORLD @ unity @ _UNITY_CAMERA
+    return pose_from_unity(numbers(row, columns[1]), numbers(row, columns[0]))
 
 
 def _read_lens(path: Path) -> Lens:
@@ -111,10 +128,16 @@ def _read_lens(path: Path) -> Lens:
     try:
         focal, center, size = value["focalLength"], value["principalPoint"], value["resolution"]
         params = [float(pair[axis]) for pair in (focal, center) for axis in "xy"]
-        return make_lens("PINHOLE", float(size["width"]), float(size["height"]), params, str(path))
+        lens = make_lens("PINHOLE", float(size["width"]), float(size["height"]), params, str(path))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
             f"{path} lacks focalLength, principalPoint or resolution.", hint=_HINT) from error
+    _, factor = fit_intrinsics(lens.params, (lens.width, lens.height), str(path))
+    if factor != 1:
+        raise FormatError(
+            f"{path} has the principal point {params[2]:.0f}, {params[3]:.0f}, but the resolution "
+            f"{lens.width}x{lens.height}: they are those of different sizes.", hint=_HINT)
+    return lens
 
 
 def _own_lens(lens: Lens, row: Mapping[str, str]) -> Lens:
@@ -132,8 +155,13 @@ def _own_lens(lens: Lens, row: Mapping[str, str]) -> Lens:
 
 
 def _time(row: Mapping[str, str]) -> float | None:
+    found = _number(row, "timestamp_us_realtime")
+    return None if found is None else found / 1e6
+
+
+def _number(row: Mapping[str, str], key: str) -> float | None:
     try:
-        return float(row["timestamp_us_realtime"]) / 1e6
+        return float(row[key])
     except (KeyError, ValueError):
         return None
 

@@ -18,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon_cli.datasets.app_frames import Z_UP, LeftOut, numbers, quoted, read_csv
+from recon_cli.datasets.app_frames import (
+    HEAD_LINES,
+    Z_UP,
+    LeftOut,
+    column_names,
+    numbers,
+    quoted,
+    read_csv,
+)
 from recon_cli.datasets.exported_files import (
     find_points,
     list_files,
@@ -44,9 +52,9 @@ def _find(path: Path) -> Path | None:
     for file in files:
         if file.suffix.lower() == ".csv" and file.is_file():
             with file.open("rb") as stream:
-                head = stream.readline(4096).decode("utf-8-sig", errors="replace")
-            names = {name.strip().lstrip("#").strip().lower() for name in head.split(",")}
-            if names >= set(_NEEDED):
+                head = [stream.readline(4096).decode("utf-8-sig", errors="replace")
+                        for _ in range(HEAD_LINES)]
+            if any(set(column_names(line.split(","))) >= set(_NEEDED) for line in head):
                 return file
     return None
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.datasets.app_frames import (
+    PICTURES,
     LeftOut,
     list_numbered,
     pose_from_quat,
@@ -25,13 +26,12 @@ from recon_cli.datasets.app_frames import (
     tracked_set,
 )
 from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
-from recon_cli.datasets.posed import PosedImage, PosedSet
+from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace.atomic import read_json
 
 _HINT = "Export the recording again from Record3D."
-_JPEG = (".jpg", ".jpeg")
 
 
 def is_record3d(folder: Path) -> bool:
@@ -57,12 +57,13 @@ def read_record3d(folder: Path) -> PosedSet:
     assert found is not None
     place, metadata, name = found
     value = read_json(metadata, dict, hint=_HINT, finite=False)
-    size = _whole(value, "w", metadata), _whole(value, "h", metadata)
+    size = _size(value, "w", "h", metadata)
     poses = _list(value, "poses", metadata)
+    depth_size = _size(value, "dw", "dh", metadata)
     own = value.get("perFrameIntrinsicCoeffs") or []
     times = value.get("frameTimestamps") or []
     left_out, listed = LeftOut(), []
-    images = list_numbered(place / name, _JPEG)
+    images = list_numbered(place / name, PICTURES)
     for number, path in images.items():
         if number >= len(poses):
             left_out.add(path.name, "beyond the list of poses")
@@ -70,14 +71,20 @@ def read_record3d(folder: Path) -> PosedSet:
         viewmat = left_out.pose(path.name, _pose, poses[number], opengl=True)
         if viewmat is None:
             continue
-        lens = left_out.lens(path.name, size, _intrinsics, value, own, number, metadata)
+        try:
+            own_size = size or image_size(path)
+        except FormatError:
+            left_out.add(path.name, "that cannot be read")
+            continue
+        lens = left_out.lens(path.name, own_size, _intrinsics, value, own, number, metadata)
         if lens is None:
             continue
         listed.append(PosedImage(
-            path.name, path, lens, viewmat, depth=_depth(place, path, lens, value),
+            path.name, path, lens, viewmat, depth=_depth(place, path, lens, depth_size),
             time=_time(times, number)))
     posed = tracked_set(
-        "record3d", listed, folder, left_out, up=None, photos=quoted(place / name))
+        "record3d", listed, folder, left_out, up=None, photos=quoted(place / name),
+        bare=len(set(range(len(poses))) - set(images)))
     return posed
 
 
@@ -96,28 +103,38 @@ def _intrinsics(
     k = _list(value, "K", metadata)  # old files have this alone
     if len(k) != 9:
         raise FormatError(f"{metadata} has {len(k)} numbers as K, needed 9.", hint=_HINT)
+    if k[2] and k[5] and not k[6] and not k[7]:
+        raise FormatError(f"{metadata} has K row by row, needed column by column.", hint=_HINT)
     return k[0], k[4], k[6], k[7]
 
 
-def _depth(place: Path, path: Path, lens: Lens, value: dict[str, Any]) -> DepthFile | None:
+def _depth(
+    place: Path, path: Path, lens: Lens, size: tuple[int, int] | None
+) -> DepthFile | None:
     """Returns the depth of an image, None where its file is missing."""
     exr, packed = place / "depth" / f"{path.stem}.exr", path.with_suffix(".depth")
     if exr.is_file():
         return DepthFile(exr, 1.0, lens, reliable=LIDAR_RANGE)
     if not packed.is_file():
         return None
-    shape = (_whole(value, "dh", place), _whole(value, "dw", place))
+    shape = size[::-1] if size else None
     levels = path.with_suffix(".conf")
     return DepthFile(
         packed, 1.0, lens, reliable=LIDAR_RANGE, shape=shape,
         confidence=ConfidenceFile(levels) if levels.is_file() else None)
 
 
-def _whole(value: dict[str, Any], key: str, where: Path) -> int:
-    number = value.get(key)
-    if not isinstance(number, (int, float)) or not 1 <= number <= 1 << 16:
-        raise FormatError(f"{where} has {key} = {number!r:.40}; needed are pixels.", hint=_HINT)
-    return int(number)
+def _size(
+    value: dict[str, Any], width: str, height: str, where: Path
+) -> tuple[int, int] | None:
+    """Returns a size in pixels, None where old files lack it."""
+    if width not in value or height not in value:
+        return None
+    for key in (width, height):
+        number = value[key]
+        if not isinstance(number, (int, float)) or not 1 <= number <= 1 << 16:
+            raise FormatError(f"{where} has {key} = {number!r:.40}; needed are pixels.", hint=_HINT)
+    return int(value[width]), int(value[height])
 
 
 def _list(value: dict[str, Any], key: str, where: Path) -> list[Any]:

@@ -5,28 +5,32 @@ NAME_calib/<stamp>.yaml (OpenCV's), NAME_camera_poses.txt: `#timestamp x y z qx 
 without the id. Poses are camera to world, OpenCV's axes, z up, metres, optimised. With --images_id
 files are called by the id. Several cameras have _0, _1 at the ends of names. Without it,
 NAME_poses.txt holds the robot's base: the camera is base * local_transform of its yaml.
+NAME_confidence/<stamp>.png says how far depth is to be trusted, on a scale that is written nowhere.
 (introlab/rtabmap: tools/Export/main.cpp, Graph.cpp, CameraModel.cpp.)
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from recon_cli.datasets.app_frames import (
     MILLIMETRE,
     PICTURES,
     Z_UP,
     LeftOut,
+    fit_intrinsics,
     pose_from_quat,
     quoted,
     tracked_set,
 )
-from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
+from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens, make_lens
@@ -39,6 +43,8 @@ _HINT = "Export again: rtabmap-export --images --poses_camera --poses_format 11 
 _NEAR = 1e-4  # seconds; stamps are written with 6 decimals
 _PLUMB_BOB = (4, 5)  # k1 k2 p1 p2 (k3)
 _RATIONAL = 8  # and k4 k5 k6
+_SCALES = (2, 100, 255)  # largest values of confidence: ARKit's levels, percent, 8 bits
+_ASKED = 20  # files of confidence that are looked at for the largest value
 
 
 def is_rtabmap(folder: Path) -> bool:
@@ -73,36 +79,46 @@ def read_rtabmap(folder: Path) -> PosedSet:
     InputError if there is none; FormatError if the poses have no time stamps or are damaged.
     """
     found = _find(folder)
-    left_out, listed = LeftOut(), list[PosedImage]()
+    left_out, listed, bare = LeftOut(), list[PosedImage](), 0
     for name, camera, path, base in found[:1] if found[0][3] else found:
-        listed += _list_camera(folder, name, camera, path, base, left_out)
+        images, unused = _list_camera(folder, name, camera, path, base, left_out)
+        listed += images
+        bare += unused
+    notices = [f"its confidence has values up to {scale}, which are taken as certain" for scale in
+               {image.depth.confidence.high for image in listed
+                if image.depth and image.depth.confidence}]
     posed = tracked_set(
-        "rtabmap", listed, folder, left_out, up=Z_UP,
+        "rtabmap", listed, folder, left_out, up=Z_UP, bare=bare,
         photos=quoted(_pictures(folder, found[0][0]) or folder))
-    return replace(posed, accuracy="solved")
+    return replace(posed, accuracy="solved", notices=(*posed.notices, *notices))
 
 
 def _list_camera(
     folder: Path, name: str, camera: str, path: Path, base: bool, left_out: LeftOut
-) -> list[PosedImage]:
-    """Returns the images of one camera."""
+) -> tuple[list[PosedImage], int]:
+    """Returns the images of one camera, and how many poses have none."""
     place = _pictures(folder, name)
     assert place is not None
     by_time, by_id = _read_poses(path)
+    levels = {file.stem: file for file in sorted((folder / f"{name}_confidence").glob("*.png"))}
+    scale = _confidence_scale(list(levels.values()))
     several = camera or next(place.glob("*_0.*"), None)
-    listed = []
+    listed, shown = [], set[int]()
     for image in sorted(place.iterdir(), key=lambda one: _order(one.stem)):
         if image.suffix.lower() not in PICTURES:
             continue
         stem = image.stem
         if several:
-            stem, _, number = stem.rpartition("_")
+            stem, mark, number = stem.rpartition("_")
+            if not mark and camera in ("", "_0"):
+                left_out.add(image.name, "that hold several cameras beside each other")
             if f"_{number}" != (camera or "_0"):
                 continue
         pose = _look_up(stem, by_time, by_id)
         if pose is None:
             left_out.add(image.name, f"without a pose in {path.name}")
             continue
+        shown.add(id(pose))
         calibration = folder / f"{name}_calib" / f"{image.stem}.yaml"
         try:
             lens, local = _read_calibration(calibration)
@@ -113,12 +129,25 @@ def _list_camera(
             image.name, np.matmul, pose, local if base else np.eye(4), opengl=False)
         if viewmat is None:
             continue
-        depth = folder / f"{name}_depth" / f"{image.stem}.png"
+        depth, level = folder / f"{name}_depth" / f"{image.stem}.png", levels.get(image.stem)
         listed.append(PosedImage(
             image.name, image, lens, viewmat, time=float(stem) if "." in stem else None,
-            depth=DepthFile(depth, MILLIMETRE, lens, reliable=LIDAR_RANGE)
+            depth=DepthFile(depth, MILLIMETRE, lens, reliable=LIDAR_RANGE,
+                            confidence=ConfidenceFile(level, scale) if level else None)
             if depth.is_file() else None))
-    return listed
+    return listed, len(by_time) - len(shown)
+
+
+def _confidence_scale(files: Sequence[Path]) -> int:
+    """Returns the value that means certain: the least usual one that no file exceeds."""
+    largest = 0
+    for path in files[::max(1, len(files) // _ASKED)]:
+        try:
+            with Image.open(path, formats=("PNG",)) as image:
+                largest = max(largest, int(np.asarray(image).max(initial=0)))
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            continue  # its frame says so
+    return next((scale for scale in _SCALES if largest <= scale), _SCALES[-1])
 
 
 def _order(stem: str) -> tuple[float, str]:
@@ -188,7 +217,10 @@ def _read_calibration(path: Path) -> tuple[Lens, NDArray[np.float64]]:
     if sizes[0] is None or sizes[1] is None or len(matrix) != 9:
         raise FormatError(f"{path} lacks image_width, image_height or camera_matrix.")
     width, height = int(sizes[0][1]), int(sizes[1][1])
-    inner = matrix[0], matrix[4], matrix[2], matrix[5]
+    inner, factor = fit_intrinsics(
+        (matrix[0], matrix[4], matrix[2], matrix[5]), (width, height), str(path))
+    if factor != 1:
+        raise FormatError(f"{path} has intrinsics for images of another size than it says.")
     lens = make_lens("PINHOLE", width, height, inner, str(path))
     local = _data(text, "local_transform")
     transform = np.eye(4)

@@ -14,7 +14,6 @@ from recon_cli.datasets.app_frames import (
     MILLIMETRE,
     PICTURES,
     LeftOut,
-    fit_intrinsics,
     list_numbered,
     quoted,
     tracked_set,
@@ -59,7 +58,8 @@ def read_scanner_app(folder: Path) -> PosedSet:
             listed.append(PosedImage(
                 path.name, path, image[0], image[1], depth=depth, time=image[2]))
     return tracked_set(
-        "3dscannerapp", listed, folder, left_out, photos=f"{quoted(folder)}/frame_*.jpg")
+        "3dscannerapp", listed, folder, left_out, photos=f"{quoted(folder)}/frame_*.jpg",
+        bare=len(set(texts) - set(images)))
 
 
 def _list_frame(path: Path, text: Path, left_out: LeftOut) -> Any:
@@ -75,13 +75,13 @@ def _list_frame(path: Path, text: Path, left_out: LeftOut) -> Any:
     viewmat = left_out.pose(path.name, value.get, _POSE, opengl=True)
     if viewmat is None:
         return None
-    lens = left_out.lens(path.name, size, _intrinsics, value.get("intrinsics"), size, text)
+    lens = left_out.lens(path.name, size, _intrinsics, value.get("intrinsics"))
     if lens is None:
         return None
     time = value.get("time")
     return lens, viewmat, float(time) if isinstance(time, (int, float)) else None
 
 
-def _intrinsics(matrix: Any, size: tuple[int, int], where: Path) -> tuple[float, ...]:
+def _intrinsics(matrix: Any) -> tuple[Any, ...]:
     fx, _, cx, _, fy, cy, _, _, _ = matrix
-    return fit_intrinsics((fx, fy, cx, cy), size, str(where))[0]
+    return fx, fy, cx, cy

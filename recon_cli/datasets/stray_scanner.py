@@ -4,7 +4,7 @@ Frame n of the video belongs to the row and to the files of depth that are numbe
 times say. Poses are camera to world with OpenCV's axes, in ARKit's world: metres, y up. Since April
 2026 each row has its own intrinsics; camera_matrix.csv holds those of the last frame. Depth and
 confidence are PNGs, in millimetres and as 0, 1, 2. (strayrobots/scanner, docs/format.md, issues 11
-and 17.) The units of imu.csv differ between versions, so it is not read.
+and 17.) Accelerations of imu.csv say whether y is up.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from recon_cli.capture.video import open_video, read_declared_length
 from recon_cli.datasets.app_frames import (
     MILLIMETRE,
+    Y_UP,
     LeftOut,
     fit_intrinsics,
     list_numbered,
@@ -29,11 +30,14 @@ from recon_cli.datasets.app_frames import (
     tracked_set,
 )
 from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.phone_gravity import read_gravity
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
 
 _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_IMU = "imu.csv"
+_MOST_TILTED_DEG = 5.0  # by which ARKit's y may miss up; it is good to about one
 _SPARE_ROWS, _SPARE_SHARE = 3, 0.02  # by which rows and frames of a whole recording differ
 _INNER = ("fx", "fy", "cx", "cy")
 
@@ -52,7 +56,7 @@ def read_stray(folder: Path) -> PosedSet:
     rows = read_csv(odometry, ("frame", *_POSE))
     size, count = _measure(video)
     inner, notices = _read_matrix(folder / _MATRIX, size, rows)
-    depths = list_numbered(folder / "depth", (".png",))
+    depths = list_numbered(folder / "depth", (".png", ".npy"))  # .npy: old versions
     levels = list_numbered(folder / "confidence", (".png",))
     left_out, listed, seen = LeftOut(), [], set[int]()
     for row in rows:
@@ -68,7 +72,7 @@ def read_stray(folder: Path) -> PosedSet:
         viewmat = left_out.pose(name, _pose, row, opengl=False)
         if viewmat is None:
             continue
-        lens = left_out.lens(name, size, _intrinsics, row, inner, size)
+        lens = left_out.lens(name, size, _intrinsics, row, inner)
         if lens is None:
             continue
         confidence = ConfidenceFile(levels[number]) if number in levels else None
@@ -83,7 +87,27 @@ def read_stray(folder: Path) -> PosedSet:
     if count and abs(count - len(rows)) > max(_SPARE_ROWS, _SPARE_SHARE * count):
         notices.append(f"the video has {count} frames, but {_ODOMETRY} {len(rows)} rows: one of "
                        "them is cut short, or of another recording")
-    return replace(posed, notices=(*posed.notices, *notices))
+    return _check_up(replace(posed, notices=(*posed.notices, *notices)), folder / _IMU)
+
+
+def _check_up(posed: PosedSet, imu: Path) -> PosedSet:
+    """Returns the set with up by its accelerations where these are sure that y is not."""
+    timed = [image for image in posed.images if image.time is not None]
+    if not (imu.is_file() and timed):
+        return posed  # older recordings have none
+    try:
+        gravity = read_gravity(imu, [image.time or 0.0 for image in timed],
+                               np.stack([image.viewmat for image in timed]))
+    except FormatError as error:
+        return replace(posed, notices=(*posed.notices, f"{imu.name} is not read: {error.message}"))
+    if gravity is None or not gravity.is_sure:
+        return posed
+    off = float(np.degrees(np.arccos(np.clip(gravity.up @ np.array(Y_UP), -1, 1))))
+    if off <= _MOST_TILTED_DEG:
+        return posed
+    x, y, z = gravity.up
+    return replace(posed, up=(float(x), float(y), float(z)), notices=(*posed.notices, (
+        f"up is taken from {imu.name}: it is {off:.0f} degrees off the y axis of the poses")))
 
 
 def _measure(video: Path) -> tuple[tuple[int, int], int]:
@@ -123,12 +147,10 @@ def _pose(row: Mapping[str, str]) -> NDArray[np.float64]:
     return pose_from_quat(numbers(row, _POSE[3:]), numbers(row, _POSE[:3]))
 
 
-def _intrinsics(
-    row: Mapping[str, str], inner: Sequence[float] | None, size: tuple[int, int]
-) -> Sequence[float]:
+def _intrinsics(row: Mapping[str, str], inner: Sequence[float] | None) -> Sequence[float]:
     """Returns fx, fy, cx, cy of a frame: its own, else those of the last one."""
     if all(row.get(key) for key in _INNER):
-        return fit_intrinsics(numbers(row, _INNER), size, _ODOMETRY)[0]
+        return numbers(row, _INNER)
     if inner is None:
         raise KeyError("no intrinsics")
     return inner

@@ -15,11 +15,20 @@ from recon_cli.io.colmap import read_images, read_pinholes, read_points
 from recon_cli.room.measures import RoomFrame
 from recon_cli.room.scale import (
     ARBITRARY,
+    DATA_SET,
     MEASURED,
     PICKED_ERROR,
     Measurement,
     ScaleBetween,
     measure,
+)
+from recon_cli.room.scale_fusion import (
+    GIVEN,
+    GIVEN_ERROR,
+    MEASURED_BETWEEN,
+    FusedScale,
+    ScaleSource,
+    fuse_measured,
 )
 from recon_cli.scene.gravity import camera_up, find_gravity, turn_onto
 from recon_cli.scene.similarity import Similarity
@@ -39,7 +48,8 @@ class ExportFrame:
 
     similarity: Similarity  # from the world of the training to this frame
     up: NDArray[np.float64]  # [3] unit vector in it; the mean up of the cameras if up was not found
-    measurement: Measurement | None  # that gave the scale; None if nothing was measured
+    measurement: Measurement | None  # of the user; None if nothing was measured
+    fused: FusedScale | None = None  # the scale by it and by all that sfm knew; None without it
 
 
 def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
@@ -47,8 +57,13 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
 
     ConfigError if --scale-between does not name a place, or --transform is not a similarity.
     """
-    measurement = _measure_scale(config, inputs)
-    similarity = Similarity(scale=measurement.scale) if measurement else Similarity()
+    measurement, fused = _measure_scale(config, inputs), None
+    similarity = Similarity()
+    if measurement is not None:
+        fused = fuse_measured(measurement.scale, measurement.error, _known_sources(
+            WorldSummary.read(inputs.folders["sfm"])))
+        assert fused.scale is not None  # what the user measured decides
+        similarity = Similarity(scale=fused.scale)
     up = _find_up(inputs, warn=config.up is not None)
     if config.up is not None:
         similarity = Similarity(rotation=turn_onto(up, np.array(UP[config.up]))).after(similarity)
@@ -61,25 +76,27 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
                 hint="It must be a rotation times one scale above 0, with a translation in its "
                 "last column.") from error
         similarity = transform.after(similarity)
-    return ExportFrame(similarity, similarity.rotation @ up, measurement)
+    return ExportFrame(similarity, similarity.rotation @ up, measurement, fused)
 
 
 def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
     """Returns the frame for measures; StageError if scale or up is unknown: none is guessed."""
     world = WorldSummary.read(inputs.folders["sfm"])
     source = world.evidence.scale_source if world else ARBITRARY
-    if frame.measurement is None and source == ARBITRARY:
+    if frame.fused is None and source == ARBITRARY:
         raise StageError(
             f"{PLAN} cannot be measured: the scale is arbitrary.",
             hint="Give one known length with --scale-between A B METRES.")
-    scale = frame.similarity.scale / (frame.measurement.scale if frame.measurement else 1.0)
+    scale = frame.similarity.scale / ((frame.fused and frame.fused.scale) or 1.0)
     if abs(scale - 1) > _RIGID:
         raise StageError(
             f"{PLAN} cannot be measured: --transform changes the scale, so units are no longer "
             "metres.",
             hint="Leave out the scale of --transform.")
-    picked = frame.measurement is not None or source == MEASURED
-    error = PICKED_ERROR if picked else (world and world.evidence.scale_error) or 0.0
+    error = frame.fused.error if frame.fused else max(
+        (one.error for one in _known_sources(world)), default=0.0)
+    if frame.fused is None and world and world.evidence.scale_error is not None:
+        error = world.evidence.scale_error
     if world and world.evidence.up_found:
         return RoomFrame(frame.similarity.rotation @ np.array(UP["z"]), error)
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
@@ -100,6 +117,22 @@ def _measure_scale(config: ExportConfig, inputs: StageInputs) -> Measurement | N
     points, _ = read_points(sparse / "points3D.bin")
     viewmats = {name: viewmat for name, _, viewmat in read_images(sparse / "images.bin")}
     return measure(ScaleBetween(*config.scale_between), points, viewmats, read_pinholes(sparse))
+
+
+def _known_sources(world: WorldSummary | None) -> list[ScaleSource]:
+    """Returns what sfm knew of the scale, in metres of a unit of its world, and what it used."""
+    if world is None:
+        return []
+    unit = Similarity.from_json(world.similarity).scale
+    known = [ScaleSource.from_json(one) for one in world.evidence.scale_sources]
+    if known:
+        return [ScaleSource(
+            "--scale-between of recon sfm" if one.name == MEASURED_BETWEEN else one.name,
+            one.scale / unit, one.error) for one in known]
+    # of older versions, which recorded several sources only
+    old = {MEASURED: ("--scale-between of recon sfm", PICKED_ERROR), DATA_SET: (GIVEN, GIVEN_ERROR)}
+    name = old.get(world.evidence.scale_source)
+    return [ScaleSource(name[0], 1.0, name[1])] if name else []
 
 
 def _find_up(inputs: StageInputs, *, warn: bool) -> NDArray[np.float64]:

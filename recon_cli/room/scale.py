@@ -19,6 +19,7 @@ ARBITRARY, DATA_SET, MEASURED, FUSED = "arbitrary", "data set", "measured", "fus
 # Relative error of a distance between two pixels: the depth of a pick in the middle was 0.5% and
 # 0.7% off in two rendered rooms, see _REACH. Of other places that of the measuring itself.
 PICKED_ERROR, PLACED_ERROR = 0.007, 0.003
+END_METRES = 0.003  # by which each end of a length is missed with a tape or a click: assumed
 # Largest distance of a sparse point from a pixel, as a share of the image's width. In two rendered
 # rooms picks within two pixels of a corner had a depth 0.5% and 0.7% off in the middle, 5% in the
 # worst tenth; of picks anywhere a third found a point within 3 pixels, a sixth another surface.
@@ -56,12 +57,7 @@ class Measurement:
     a: NDArray[np.float64]  # [3] world units
     b: NDArray[np.float64]  # [3]
     scale: float  # metres in one world unit
-
-    @property
-    def error(self) -> float:
-        """The relative standard error of the scale."""
-        picked = any(":" in place for place in (self.request.a, self.request.b))
-        return PICKED_ERROR if picked else PLACED_ERROR
+    error: float  # relative standard error of the scale
 
     def to_json(self) -> dict[str, Any]:
         """Returns the measurement as JSON values."""
@@ -94,7 +90,7 @@ def measure(
     pinholes: Mapping[str, Pinhole],  # needed only of frames that are named with a pixel
 ) -> Measurement:
     """Returns the metres of a world unit; ConfigError if a place is unknown or both are equal."""
-    a, b = (
+    (a, a_reach), (b, b_reach) = (
         _locate(parse_place(text.strip(), viewmats.keys()), points, viewmats, pinholes)
         for text in (request.a, request.b))
     distance = float(np.linalg.norm(a - b))
@@ -102,7 +98,12 @@ def measure(
         raise ConfigError(
             f"{request.a} and {request.b} are the same point, "
             f"{','.join(f'{value:.4g}' for value in a)}.", hint=_HINT)
-    return Measurement(request, a, b, request.metres / distance)
+    # A pick is wrong along its ray, by a share of its depth.
+    along = float(np.hypot(a_reach @ (b - a), b_reach @ (b - a))) / distance**2
+    least = PICKED_ERROR if a_reach.any() or b_reach.any() else PLACED_ERROR
+    ends = math.sqrt(2) * END_METRES / request.metres
+    return Measurement(request, a, b, request.metres / distance, math.hypot(
+        max(least, PICKED_ERROR * along), ends))
 
 
 def _frame(text: str, names: Collection[str]) -> str | None:
@@ -133,12 +134,14 @@ def _locate(
     points: NDArray[np.float64],
     viewmats: Mapping[str, NDArray[np.float64]],
     pinholes: Mapping[str, Pinhole],
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns a place [3], and the way [3] from the camera whose pixel it is, else 0."""
     if place.frame is None:
-        return np.array(place.xyz)
+        return np.array(place.xyz), np.zeros(3)
     viewmat = viewmats[place.frame]
+    center = np.asarray(-viewmat[:3, :3].T @ viewmat[:3, 3])
     if place.pixel is None:
-        return np.asarray(-viewmat[:3, :3].T @ viewmat[:3, 3])
+        return center, np.zeros(3)
     u, v = place.pixel
     pinhole = pinholes.get(place.frame)
     if pinhole is None:
@@ -147,7 +150,8 @@ def _locate(
             hint="Name frames (their cameras) or points x,y,z instead of FRAME:u,v.")
     depth = _depth_at(place.frame, u, v, points @ viewmat[:3, :3].T + viewmat[:3, 3], pinhole)
     ray = np.array([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, 1.0])
-    return np.asarray(viewmat[:3, :3].T @ (depth * ray - viewmat[:3, 3]))
+    reach = np.asarray(viewmat[:3, :3].T @ (depth * ray))
+    return center + reach, reach
 
 
 def _depth_at(

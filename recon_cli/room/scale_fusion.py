@@ -1,4 +1,4 @@
-"""One scale from all evidence: tracked poses, sensor depth, a measured distance.
+"""One scale from all evidence: tracked poses, sensor depth, the data set, a measured distance.
 
 Each source says how many metres a unit has, and how exactly. Sources that agree are averaged by
 their inverse variance; one that contradicts the others is named and not used.
@@ -14,6 +14,10 @@ from dataclasses import dataclass
 from recon_cli.errors import list_names
 from recon_cli.workspace.json_record import JsonRecord
 
+# sources
+MEASURED_BETWEEN, GIVEN = "--scale-between", "the data set"
+# Relative error of the unit of a data set in metres: assumed, as of phones 0.3 to 1% are reported.
+GIVEN_ERROR = 0.003
 INTERVAL = 1.96  # standard errors, of an interval of 95% of a normal distribution
 # Sources contradict each other if they differ by more than this multiple of their common error.
 MOST_APART = 3.0
@@ -32,7 +36,7 @@ class ScaleSource(JsonRecord):
 
 
 @dataclass(frozen=True)
-class FusedScale:
+class FusedScale(JsonRecord):
     """The scale by all sources that agree."""
 
     scale: float | None  # metres in a unit; None where sources contradict and none can be chosen
@@ -40,18 +44,30 @@ class FusedScale:
     used: tuple[ScaleSource, ...]
     contradicting: tuple[ScaleSource, ...]
 
+    @property
+    def interval(self) -> float:
+        """Half of the interval of 95%, as a share of a length."""
+        return INTERVAL * self.error
+
     def describe(self) -> tuple[str, ...]:
         """Returns sentences for the terminal."""
-        others = tuple(
+        if self.scale is None:
+            return (f"The scale is arbitrary, as its sources contradict each other: "
+                    f"{describe_sources((*self.used, *self.contradicting))}. "
+                    "--scale-between A B METRES decides.",)
+        return (f"One unit is one metre, to {self.interval:.1%}, by {_names(self.used)}.",
+                *self.describe_contradicting())
+
+    def describe_contradicting(self) -> tuple[str, ...]:
+        """Returns a sentence on each source that is not used."""
+        return tuple(
             f"The scale by {source.name} is {_differ(source, self.used)} than by "
             f"{_names(self.used)}: it is not used." for source in self.contradicting)
-        if self.scale is None:
-            apart = "; ".join(f"by {source.name} a unit has {source.scale:.4g} m"
-                              for source in (*self.used, *self.contradicting))
-            return (f"The scale is arbitrary, as its sources contradict each other: {apart}. "
-                    "--scale-between A B METRES decides.",)
-        return (f"One unit is one metre, to {INTERVAL * self.error:.1%}, by "
-                f"{_names(self.used)}.", *others)
+
+
+def describe_sources(sources: Sequence[ScaleSource]) -> str:
+    """Returns what each source says."""
+    return "; ".join(f"by {source.name} a unit has {source.scale:.4g} m" for source in sources)
 
 
 def fuse(sources: Sequence[ScaleSource], *, decisive: str | None = None) -> FusedScale:
@@ -81,6 +97,11 @@ def fuse(sources: Sequence[ScaleSource], *, decisive: str | None = None) -> Fuse
             return FusedScale(None, math.inf, used, others)
         error = max(error, farthest / INTERVAL)
     return FusedScale(math.exp(mean), error, used, others)
+
+
+def fuse_measured(scale: float, error: float, known: Sequence[ScaleSource]) -> FusedScale:
+    """Returns the scale by what the user measured, which decides, and by what is `known`."""
+    return fuse([ScaleSource(MEASURED_BETWEEN, scale, error), *known], decisive=MEASURED_BETWEEN)
 
 
 def _agree(one: ScaleSource, other: ScaleSource) -> bool:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.errors import SfmError
 from recon_cli.io.colmap import Pinhole
 from recon_cli.room.scale import (
     ARBITRARY,
@@ -23,12 +24,19 @@ from recon_cli.room.scale import (
     ScaleBetween,
     measure,
 )
-from recon_cli.room.scale_fusion import FusedScale, ScaleSource, fuse
+from recon_cli.room.scale_fusion import (
+    GIVEN,
+    GIVEN_ERROR,
+    MEASURED_BETWEEN,
+    FusedScale,
+    ScaleSource,
+    describe_sources,
+    fuse,
+    fuse_measured,
+)
 from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
-
-_NAME = "--scale-between"  # as a source of the scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,19 +91,33 @@ def world_transform(
     if scale_between:
         moved = {name: turn.viewmat(viewmats[name]) for name in names}
         measured = measure(scale_between, turn.points(points), moved, pinholes or {})
-    fused = None
-    if sources:
-        picked = [ScaleSource(_NAME, measured.scale, measured.error)] if measured else []
-        fused = fuse([*picked, *sources], decisive=_NAME if measured else None)
-        scale, source = fused.scale or 1.0, FUSED if fused.scale else ARBITRARY
-    else:
-        scale = measured.scale if measured else 1.0
-        source = MEASURED if measured else DATA_SET if metric else ARBITRARY
+    known = sources or ([ScaleSource(GIVEN, 1.0, GIVEN_ERROR)] if metric else [])
+    fused = (fuse_measured(measured.scale, measured.error, known) if measured
+             else fuse(known) if known else None)
+    source = _name_source(fused)
     evidence = _evidence(up, axis, strength, source, fused)
-    described = fused.describe() if fused else (_describe_scale(source, measured, metric),)
     return WorldFrame(
-        Similarity(scale=scale).after(turn), evidence, measured,
-        (*_describe_up(evidence, gravity), *described))
+        Similarity(scale=fused.scale or 1.0 if fused else 1.0).after(turn), evidence, measured,
+        (*_describe_up(evidence, gravity), *_describe_scale(source, measured, fused)))
+
+
+def refuse_contradiction(evidence: WorldEvidence, *, accepted: bool) -> None:
+    """Raises SfmError if sources of the scale contradict each other and none can be chosen."""
+    if evidence.metres or not evidence.scale_sources or accepted:
+        return
+    told = describe_sources([ScaleSource.from_json(one) for one in evidence.scale_sources])
+    raise SfmError(
+        f"What tells the scale contradicts itself, so that no length would be right: {told}.",
+        hint="Name a length that you measured with --scale-between A B METRES; or type "
+        "`recon sfm --accept-weak` for a scene in an arbitrary scale.")
+
+
+def _name_source(fused: FusedScale | None) -> str:
+    """Returns where the scale comes from."""
+    if fused is None or fused.scale is None:
+        return ARBITRARY
+    names = [source.name for source in fused.used]
+    return MEASURED if names == [MEASURED_BETWEEN] else DATA_SET if names == [GIVEN] else FUSED
 
 
 def _evidence(
@@ -137,12 +159,15 @@ def _describe_up(evidence: WorldEvidence, asked: bool) -> tuple[str, ...]:
         f"{evidence.camera_error_deg:.1f} degrees; no floor is seen, so 0 is their mean height.",)
 
 
-def _describe_scale(source: str, measured: Measurement | None, metric: bool) -> str:
-    if source == ARBITRARY:
-        return "The scale is arbitrary; --scale-between A B METRES makes one unit a metre."
-    if measured is None:
-        return "One unit is one metre, as in the data set."
+def _describe_scale(
+    source: str, measured: Measurement | None, fused: FusedScale | None
+) -> tuple[str, ...]:
+    if fused is None:
+        return ("The scale is arbitrary; --scale-between A B METRES makes one unit a metre.",)
+    if source == DATA_SET:
+        return ("One unit is one metre, as in the data set.",)
+    if source != MEASURED or measured is None:
+        return fused.describe()
     request = measured.request
-    sentence = f"One unit is one metre: {request.a} and {request.b} are {request.metres:g} m apart"
-    return f"{sentence}, {1 / measured.scale:.4g} times as long in the data set." if metric else (
-        f"{sentence}.")
+    return (f"One unit is one metre, to {fused.interval:.1%}: {request.a} and {request.b} are "
+            f"{request.metres:g} m apart.", *fused.describe_contradicting())

@@ -21,7 +21,7 @@ from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.room.scale import ScaleBetween
-from recon_cli.sfm.align_world import world_transform
+from recon_cli.sfm.align_world import refuse_contradiction, world_transform
 from recon_cli.sfm.depth_points import add_depth_points
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
@@ -41,7 +41,8 @@ def place_model(job: MappingJob) -> PlacedResult:
     """Writes the model of the job's part, moved into the world frame, into out/sparse.
 
     The axes of a data set with poses are left as they are, unless it knows up, or says that they
-    are arbitrary. ConfigError if the part, or a place of --scale-between, is unknown.
+    are arbitrary. ConfigError if the part, or a place of --scale-between, is unknown; SfmError if
+    what tells the scale contradicts itself, unless that is accepted.
     """
     check_part(job)
     part = job.parts / str(job.part)
@@ -59,6 +60,7 @@ def place_model(job: MappingJob) -> PlacedResult:
         metric=device.metric, sources=device.sources,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()
                   if not is_panorama(image.camera)})
+    refuse_contradiction(world.evidence, accepted=job.accept_weak)
     model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")
     write_model(model, folder)

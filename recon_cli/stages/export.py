@@ -63,6 +63,8 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     _refuse_without_views(config, inputs)
     pruned = "prune" in inputs.folders and config.model != "base"
     frame = choose_frame(config, inputs)
+    for text in frame.fused.describe() if frame.fused else ():
+        ctx.notice(text)
     # refused before anything is written
     room_frame = find_room_frame(inputs, frame) if PLAN in config.formats else None
     splats = read_ply(inputs.folders["prune" if pruned else "train"] / "splats.ply")
@@ -193,5 +195,6 @@ def _write_transform(
         "to": "splats.ply beside this file",
         "similarity": frame.similarity.to_json(),
         "measurement": frame.measurement.to_json() if frame.measurement else None,
+        **({"scale": frame.fused.to_json()} if frame.fused else {}),
         # subtracted from the positions of the imported file before
         **({"origin": list(origin)} if origin else {})})

@@ -10,9 +10,10 @@ import viser
 from numpy.typing import NDArray
 
 from recon_cli.scene.splats import Splats
-from recon_cli.viewer.measure import describe_points, locate_click, scale_command, scale_of
+from recon_cli.viewer.measure import LENGTHS, SHEETS, describe_points, find_scale, locate_click
 
 _COLOR = (255, 60, 60)
+_TYPED = "a length, typed below"
 _POINT = 0.004  # of the distance to the target of the camera
 
 
@@ -33,12 +34,16 @@ class MeasurePanel:
             self._on = gui.add_checkbox("Click points", False)
             self._text = gui.add_markdown(self._describe())
             back = gui.add_button_group("Points", ("undo", "clear"))
+            self._size_of = gui.add_dropdown(
+                "Known size", (_TYPED, *LENGTHS, *SHEETS), hint="What the last points are the ends "
+                "or corners of: sets the scale of this page.")
             self._known = gui.add_number(
                 "Known length (m)", 0.0, min=0.0, step=0.001,
                 hint="Of the last two points: sets the scale of this page.")
         self._on.on_update(lambda _: self._listen())
         back.on_click(lambda _: self._drop(back.value == "clear"))
         self._known.on_update(lambda _: self._set_scale())
+        self._size_of.on_update(lambda _: self._set_scale())
 
     def _listen(self) -> None:
         self._client.scene.remove_click_callback()
@@ -67,12 +72,14 @@ class MeasurePanel:
 
     def _set_scale(self) -> None:
         with self._lock:
-            scale = scale_of(np.array(self._points), self._known.value)
-            if scale is not None:
-                self._scale = scale
-                self._refresh()
-                self._text.content += (
-                    f"\n\nFor files: `{scale_command(np.array(self._points), self._known.value)}`")
+            found = find_scale(
+                np.array(self._points).reshape(-1, 3), self._size_of.value, self._known.value)
+            if isinstance(found, str):
+                self._text.content = f"{found} {self._describe()}"
+                return
+            self._scale, command = found
+            self._refresh()
+            self._text.content += f"\n\nFor files: `{command}`"
 
     def _describe(self) -> str:
         return describe_points(np.array(self._points).reshape(-1, 3), self._scale)

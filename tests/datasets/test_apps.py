@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from app_sets import APPS, relative, shots
+from app_sets import APPS
+from app_shots import shots
+from phone_writers import relative
 from PIL import Image
 
 from recon_cli.datasets.layouts import LAYOUTS, read_posed, recognise

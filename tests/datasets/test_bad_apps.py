@@ -7,21 +7,20 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
-from app_sets import (
-    APPS,
-    metashape,
+from app_sets import APPS
+from app_shots import shots
+from phone_writers import (
     nerfcapture,
     pack,
     polycam,
     r3d_entries,
-    reality_scan,
     record3d,
     rtabmap,
     scanner_app,
-    shots,
     stray,
 )
 from PIL import Image
+from solved_writers import metashape, reality_scan
 
 from recon_cli.datasets.layouts import read_posed, recognise
 from recon_cli.datasets.packed import is_packed, unpacked

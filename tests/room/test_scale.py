@@ -98,3 +98,19 @@ def test_a_point_behind_the_camera_is_not_seen():
 def test_two_names_of_one_point_are_refused(a, b):
     with pytest.raises(ConfigError, match="same point"):
         measured(a, b)
+
+
+def test_the_error_of_a_length_is_that_of_its_picks_and_of_its_ends():
+    ends = 2**0.5 * 0.003
+    assert measured("a.png", "b.png").error == pytest.approx(np.hypot(0.003, ends / 3))
+    # across the line of sight, the depth of both picks changes the length by as much
+    across = measured("a.png:300,200", "a.png:375,200", 3.0)
+    assert across.error == pytest.approx(np.hypot(0.007, ends / 3))
+    # from the second camera, whose pick lies 4 units ahead, along it: .7% of 4 in a length of 4
+    along = measured("b.png:225,200", "1,0,2", 2.0)
+    ray = np.array([-1.0, 0, 4])
+    share = 0.007 * ray @ [0, 0, 2] / 4
+    assert along.error == pytest.approx(np.hypot(share, ends / 2))
+    assert share == pytest.approx(2 * 0.007)
+    # a sheet of paper says less than a wall
+    assert measured("a.png", "b.png", 0.3).error > measured("a.png", "b.png", 3.0).error

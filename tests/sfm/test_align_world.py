@@ -11,10 +11,11 @@ import pytest
 from rooms import degrees_between, make_room
 from test_similarity import random_similarity
 
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, SfmError
 from recon_cli.room.scale import ScaleBetween
+from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.align_world import WorldFrame, world_transform
+from recon_cli.sfm.align_world import WorldFrame, refuse_contradiction, world_transform
 from recon_cli.sfm.shared_points import to_sim3d
 
 
@@ -96,7 +97,27 @@ def test_a_data_set_in_metres_keeps_its_scale_unless_something_was_measured():
     assert world.evidence.metres
     world = world_of(room, metric=True, between=ScaleBetween(A, B, distance(room, A, B)))
     assert world.evidence.scale_source == "measured"
-    assert "in the data set" in world.sentences[-1]
+    assert "The scale by the data set is" in world.sentences[-1]
+
+
+def test_sources_of_which_none_can_be_chosen_end_it_unless_that_is_accepted():
+    room = make_room()
+    sources = [ScaleSource("the tracked poses", 1.0, 0.003), ScaleSource("sensor depth", 10, 0.005)]
+
+    def world(chosen, between=None):
+        return world_transform(room.points, room.named(), gravity=True, scale_between=between,
+                               metric=True, sources=chosen)
+
+    evidence = world(sources).evidence
+    assert not evidence.metres
+    with pytest.raises(SfmError, match="tracked poses a unit has 1 m; by sensor depth") as caught:
+        refuse_contradiction(evidence, accepted=False)
+    assert caught.value.exit_code == 5
+    assert "--scale-between A B METRES" in caught.value.hint
+    refuse_contradiction(evidence, accepted=True)
+    for fine in (world(sources[:1]), world([]), world_of(room),
+                 world(sources, ScaleBetween(A, B, 2.0))):
+        refuse_contradiction(fine.evidence, accepted=False)
 
 
 def test_a_room_without_a_floor_says_so():

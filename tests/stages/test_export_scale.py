@@ -13,9 +13,12 @@ from tiny_scene import make_inputs
 from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
+from recon_cli.export.coordinate_frame import choose_frame, find_room_frame
 from recon_cli.render import render
+from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
+from recon_cli.sfm.align_world import world_transform
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export
 
@@ -74,3 +77,66 @@ def test_a_frame_without_a_camera_stops_the_export_before_it_writes(inputs, tmp_
     with pytest.raises(ConfigError, match=r"000009\.png"):
         export.run(config, inputs, tmp_path / "out", StageContext())
     assert list((tmp_path / "out").iterdir()) == []
+
+
+APART = float(np.linalg.norm([0.4 - 0.4 * np.cos(6), -0.4 * np.sin(6), -0.6]))  # frames 0 and 6
+
+
+def know_scale(inputs, **more):
+    """Writes the world that sfm would record, with z up."""
+    viewmats = {f"{at:06d}.png": np.eye(4) for at in range(3)}
+    world = world_transform(np.zeros((0, 3)), viewmats, gravity=True, given_up=(0.0, 0.0, 1.0),
+                            **{"scale_between": None, "metric": True, **more})
+    (inputs.folders["sfm"] / "world.json").write_text(json.dumps(world.summary().to_json()))
+
+
+def measured(metres):
+    return ExportConfig(scale_between=("000000.png", "000006.png", metres))
+
+
+def test_what_sfm_knew_and_what_is_measured_later_give_one_scale(inputs, tmp_path):
+    # One unit of the mapper had 2 m, by the device to 1%: the world is in metres.
+    know_scale(inputs, sources=[ScaleSource("the tracked poses", 2.0, 0.01)])
+    frame = choose_frame(measured(1.01 * APART), inputs)
+    error = np.hypot(0.003, np.sqrt(2) * 0.003 / (1.01 * APART))  # of the measuring
+    weights = np.array([error, 0.01])**-2.0
+    assert np.log(frame.fused.scale) == pytest.approx(np.log(1.01) * weights[0] / weights.sum())
+    assert find_room_frame(inputs, frame).scale_error == pytest.approx(weights.sum()**-0.5)
+    export.run(measured(1.01 * APART), inputs, tmp_path / "out", StageContext())
+    record = json.loads((tmp_path / "out" / "transform.json").read_text())
+    assert record["scale"]["error"] == pytest.approx(weights.sum()**-0.5)
+    assert [one["name"] for one in record["scale"]["used"]] == [
+        "--scale-between", "the tracked poses"]
+
+
+def test_a_length_that_contradicts_what_sfm_knew_decides_and_both_are_named(
+    inputs, tmp_path
+):
+    know_scale(inputs, sources=[ScaleSource("sensor depth", 1.0, 0.005)])
+    told = []
+
+    class Context(StageContext):
+        def notice(self, text):
+            told.append(text)
+
+    export.run(measured(1.5 * APART), inputs, tmp_path / "out", Context())
+    record = json.loads((tmp_path / "out" / "transform.json").read_text())
+    assert record["similarity"]["scale"] == pytest.approx(1.5)
+    assert any("The scale by sensor depth is 33.3% smaller than by --scale-between" in text
+               for text in told)
+
+
+def test_a_length_of_sfm_and_one_of_export_are_both_used(inputs):
+    know_scale(inputs, metric=False, sources=[ScaleSource("--scale-between", 3.0, 0.01)])
+    frame = choose_frame(measured(APART), inputs)
+    assert [one.name for one in frame.fused.used] == [
+        "--scale-between", "--scale-between of recon sfm"]
+    assert frame.fused.scale == pytest.approx(1)
+
+
+@pytest.mark.parametrize("error", [0.003, 0.02])
+def test_measures_carry_the_interval_of_the_scale_that_sfm_found(inputs, error):
+    sources = [] if error == 0.003 else [ScaleSource("sensor depth", 1.0, error)]
+    know_scale(inputs, sources=sources)  # without any, the data set's own unit
+    frame = choose_frame(ExportConfig(), inputs)
+    assert find_room_frame(inputs, frame).scale_error == pytest.approx(error)

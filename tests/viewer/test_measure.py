@@ -10,7 +10,10 @@ import torch
 
 from recon_cli.scene.splats import Splats
 from recon_cli.viewer.measure import (
+    LENGTHS,
+    SHEETS,
     describe_points,
+    find_scale,
     locate_click,
     polygon_area,
     scale_command,
@@ -66,3 +69,36 @@ def test_one_known_length_sets_the_scale():
     for metres in (0.0, -1.0, math.nan, math.inf):
         assert scale_of(SQUARE[:2], metres) is None
     assert scale_command(SQUARE[:2], 3.0) == "recon export --scale-between 0,0,1 2,0,1 3"
+
+
+def turned(points: np.ndarray) -> np.ndarray:
+    return points @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0] + [3, 1, 2]
+
+
+@pytest.mark.parametrize("known", SHEETS)
+@pytest.mark.parametrize("first", range(4))
+def test_the_corners_of_a_sheet_set_the_scale_whichever_comes_first(known, first):
+    long, short = SHEETS[known]
+    sheet = np.array([[0, 0, 0], [long, 0, 0], [long, short, 0], [0, short, 0]])
+    points = turned(np.vstack([[[9, 9, 9]], np.roll(sheet, first, axis=0) / 0.4]))
+    scale, command = find_scale(points, known, 0.0)
+    assert scale == pytest.approx(0.4)
+    words = command.split()
+    a, b = (np.array([float(number) for number in word.split(",")]) for word in words[3:5])
+    # the command says the same: metres for as many units
+    assert float(words[5]) / np.linalg.norm(a - b) == pytest.approx(0.4, rel=1e-3)
+
+
+def test_corners_that_form_no_sheet_set_nothing():
+    known = next(iter(SHEETS))
+    assert "2 of 4" in find_scale(SQUARE[:2], known, 0.0)
+    for corners in (SQUARE, SQUARE[[0, 2, 1, 3]] * [1.41, 1, 1], SQUARE[[0, 0, 1, 1]]):
+        assert "not the corners" in find_scale(corners, known, 0.0)
+
+
+def test_a_door_has_its_height_and_other_lengths_are_typed():
+    for known, metres in LENGTHS.items():
+        assert find_scale(SQUARE[:2], known, 0.0)[0] == pytest.approx(metres / 2)
+    assert find_scale(SQUARE[:2], "a length", 3.0)[0] == pytest.approx(1.5)
+    assert "how far" in find_scale(SQUARE[:2], "a length", 0.0)
+    assert "how far" in find_scale(SQUARE[:1], "a length", 3.0)
