@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.io.depth_maps import DepthMap, read_depth, read_depth_list
+from recon_cli.io.depth_maps import lens_camera, read_depth_list, read_sure_depth
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.sfm.job import MappingJob, StepLog
 from recon_cli.sfm.results import ModelResult
@@ -37,7 +37,6 @@ TRACKED_ERROR, DEPTH_ERROR = 0.003, 0.005
 MAX_TURN_DEG, MAX_TURN_SHARE, MAX_LENGTH_SHARE = 2.0, 0.1, 0.2
 MOST_DEPTH_MAPS = 40  # evenly spread
 FEWEST_DEPTHS = 20  # points of a frame
-SURE = 2  # level of confidence, of 0 to 2
 MAX_UP_SPREAD_DEG = 5.0  # median angle of up, by single frames, to the mean of all
 
 
@@ -203,23 +202,6 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
     # of a median: 1.25 times that of a mean
     error = 1.25 * spread / np.sqrt(len(ratios))
     return ScaleSource(DEPTH, scale, float(np.hypot(error, DEPTH_ERROR)))
-
-
-def read_sure_depth(ingest: Path, name: str, one: DepthMap) -> NDArray[np.float32]:
-    """Returns the depth [h, w] of a frame in world units, 0 where it is not sure or too far."""
-    depth, levels = read_depth(ingest, name, one)
-    if levels is not None:
-        depth[levels < SURE] = 0
-    if one.reliable is not None:
-        depth[depth > one.reliable] = 0
-    return depth
-
-
-def lens_camera(one: DepthMap) -> pycolmap.Camera:
-    """Returns the camera of a depth map."""
-    lens = one.lens
-    return pycolmap.Camera(
-        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
 
 
 def _seen_depths(
