@@ -28,6 +28,9 @@ _MOST = 65535  # value of 16 bits
 _WHOLE = 0.02  # of a unit: what float32 leaves of a multiple
 _CONFIDENCE = ".confidence.png"
 SURE = 2  # level of confidence, of 0 to 2
+# Relative noise at the points of a model, beyond which depth is not of this model, or tells less
+# than the images: phones have about .01, cheap cameras .03.
+MOST_NOISE = 0.1
 # Relative difference of neighbouring depths that is an edge, beside which depth is of nothing.
 EDGE = 0.05
 
@@ -109,9 +112,8 @@ def read_sure_depth(ingest: Path, name: str, one: DepthMap) -> NDArray[np.float3
     return depth
 
 
-def lens_camera(one: DepthMap) -> pycolmap.Camera:
-    """Returns the camera of a depth map."""
-    lens = one.lens
+def lens_camera(lens: Lens) -> pycolmap.Camera:
+    """Returns the camera of a lens, as of a depth map."""
     return pycolmap.Camera(
         model=lens.model, width=lens.width, height=lens.height, params=lens.params)
 

@@ -66,7 +66,7 @@ def _unproject(
     rows, columns = np.nonzero(depth[step // 2::step, step // 2::step])
     rows, columns = rows * step + step // 2, columns * step + step // 2
     z = depth[rows, columns].astype(np.float64) / metres
-    rays = np.asarray(lens_camera(one).cam_from_img(np.column_stack([columns, rows]) + 0.5))
+    rays = np.asarray(lens_camera(one.lens).cam_from_img(np.column_stack([columns, rows]) + 0.5))
     local = np.column_stack([rays.reshape(-1, 2) * z[:, None], z])
     rgb = read_png(frames / image.name)
     pixels = np.nan_to_num(np.asarray(image.camera.img_from_cam(local)).reshape(-1, 2), nan=-1)

@@ -6,6 +6,7 @@ result lies outside the frame (blank_pixels = 0): a model learns no black border
 
 from __future__ import annotations
 
+import dataclasses
 import filecmp
 import shutil
 from collections import Counter
@@ -59,6 +60,8 @@ def place_model(job: MappingJob) -> PlacedResult:
         metric=device.metric, sources=device.sources,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()
                   if not is_panorama(image.camera)})
+    if device.remark:
+        world = dataclasses.replace(world, sentences=(*world.sentences, device.remark))
     model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")
     write_model(model, folder)

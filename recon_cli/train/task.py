@@ -31,6 +31,7 @@ class Task:
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
     stereo: StereoPoints | None = None  # of the training views; None where they are not known
+    depth_refused: str = ""  # why no view has sensor depth although the capture has some
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
         """Returns 1 for each position where Gaussians may be added, else 0."""
@@ -49,10 +50,18 @@ class Task:
             return self.extent
         return self.nearness
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether a sensor measured the depth of any training view."""
+        return any(view.depth is not None for view in self.train)
+
     @cached_property
     def pyramid(self) -> Pyramid:
-        """The training views at every size."""
-        return Pyramid(self.train, page_locked=self.device.type == "cuda")
+        """The training views at every size, with sensor depth if that is part of the loss."""
+        views = self.train
+        if self.schedule.config.depth != "on":
+            views = [replace(view, depth=None) for view in views]
+        return Pyramid(views, page_locked=self.device.type == "cuda")
 
 
 def _in_file(view: TrainView, file: ImageFile | None) -> TrainView:
