@@ -220,9 +220,9 @@ class TrainConfig(StageConfig):
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
         choices=("auto", "on", "off"))
     depth: str = option(
-        "auto", "Compare with sensor depth, where it is sure; auto: with budget, unless a trial "
-        "shows a loss.",
-        choices=("auto", "on", "off"), late=True)
+        "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
+        "budget, unless a trial shows a loss.",
+        choices=("auto", "on", "off"), late=True, expert=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,

@@ -6,6 +6,7 @@ others. Depth that is far or not sure is left out, and so is what a single frame
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +32,15 @@ _HALF = 1 << 20  # cells on each side of the origin
 
 
 def add_depth_points(
-    model: pycolmap.Reconstruction, ingest: Path, frames: Path, metres: float
+    model: pycolmap.Reconstruction, ingest: Path, frames: Path, metres: float, *,
+    without: Collection[str] = (),
 ) -> int:
     """Adds points to a model, in place, by the depth maps of ingest; returns how many.
 
-    `metres` is the length of a unit of the model. FormatError if a map or frame is damaged.
+    `metres` is the length of a unit of the model, `without` the names of frames that are held out.
+    FormatError if a map or frame is damaged.
     """
-    maps = read_depth_list(ingest)
+    maps = {name: one for name, one in read_depth_list(ingest).items() if name not in without}
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     names = sorted(set(maps) & set(images))
     count = min(len(names), MOST_MAPS)

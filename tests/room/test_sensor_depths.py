@@ -14,6 +14,7 @@ from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.train_view import SensorDepth
 
 NOISE = 0.02
+EVERY = range(len(AROUND))
 rng = np.random.default_rng(0)
 
 
@@ -26,7 +27,7 @@ def sensor(camera, depth, noise=NOISE, step=2, share=1.0):
     return SensorDepth(rays[used], z[used], noise, len(row))
 
 
-def maps_of(off=1.0, seen=range(len(AROUND)), **more):
+def maps_of(off=1.0, seen=EVERY, **more):
     """Maps of the wall by the Gaussians, off by a factor, and views of which some have depth."""
     depths = [wall(view, 0.0)[0] for view in AROUND]
     views = [replace(view, depth=sensor(view.camera, depth, **more)) if row in seen else view
