@@ -31,6 +31,7 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import SensorDepth
 
 MOST_SAMPLES = 16_000  # of a map, for training: one for 4 to 13 pixels of an image
+SAMPLE_BYTES = 12  # ray and depth
 ALL_SAMPLES = 400_000  # for meshes: every pixel of the sensors of phones and cheap cameras
 LEAST_POINTS = 20  # of a view, by which its own depth is judged
 FEWEST_POINTS = 200  # of all views

@@ -18,7 +18,12 @@ from recon_cli.errors import ConfigError, FormatError, TrainingError
 from recon_cli.io import views as view_files
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
-from recon_cli.io.sensor_depth import SensorViews, read_sensor_depth
+from recon_cli.io.sensor_depth import (
+    MOST_SAMPLES,
+    SAMPLE_BYTES,
+    SensorViews,
+    read_sensor_depth,
+)
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.image_file import ImageFile
@@ -153,7 +158,7 @@ def read_config(folder: Path) -> RunConfig:
 class MemoryEstimate:
     """The bytes that a run needs at its peak."""
 
-    images: int  # all views as uint8, and their masks
+    images: int  # all views as uint8, their masks and sensor depth
     pixel_buffers: int  # of one step, for each pixel of a view
     gaussians: int  # parameters, gradients, moments at the largest count
     gaussian_buffers: int  # of one step, for each Gaussian
@@ -176,11 +181,12 @@ class MemoryEstimate:
 
 def estimate_memory(
     *, views: int, width: int, height: int, gaussians: int, fused: bool, sh_degree: int = 3,
-    masks: int = 0, free: int | None = None,
+    masks: int = 0, depths: int = 0, free: int | None = None,
 ) -> MemoryEstimate:
     """Returns the memory for views of at most width x height; `fused` means without autograd.
 
-    Images that take too much of `free` bytes lie in a file.
+    `masks` and `depths` are the numbers of views with a mask, and maybe with sensor depth. Images
+    that take too much of `free` bytes lie in a file.
     """
     pixels = width * height
     images = int(_REDUCED * pixels * (3 * views + masks))
@@ -192,7 +198,8 @@ def estimate_memory(
     per_gaussian = 4 * (_COPIES * (_FLOATS + rest) + max(_LARGEST, rest))
     factor = 1 if fused else _TORCH_FACTOR
     return MemoryEstimate(
-        images=images, pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
+        images=images + depths * MOST_SAMPLES * SAMPLE_BYTES,
+        pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
         gaussians=gaussians * per_gaussian,
         gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM,
         in_file=in_file)
@@ -253,7 +260,9 @@ def _memory(
     return estimate_memory(
         views=len(views), width=width, height=height, gaussians=gaussians,
         fused=ctx.backend == "numba", sh_degree=config.sh_degree,
-        masks=sum(view.mask is not None for view in views), free=_host_bytes(ctx))
+        masks=sum(view.mask is not None for view in views),
+        depths=0 if scene.depth is None or config.depth == "off" else len(scene.train),
+        free=_host_bytes(ctx))
 
 
 def _free_bytes(ctx: StageContext) -> int:
