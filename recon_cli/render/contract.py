@@ -134,6 +134,7 @@ class StepOptions:
     scores: bool = False  # hits and blend weights too, over the mask; else they mean nothing
     loo: bool = False  # likewise
     harmonics: bool = True  # without, the gradient of sh_rest may be left as it is
+    depth_weight: float = 0.0  # of the mean over what a sensor measured, in the loss
 
 
 class Renderer(Protocol):

@@ -91,7 +91,8 @@ class AsyncTrainer:
         gathers, moves_sh = schedule.gathers(iteration), schedule.moves_sh(iteration)
         options = StepOptions(
             schedule.sh_degree(iteration), schedule.config.ssim_weight,
-            details=gathers and self._strategy.variance, harmonics=moves_sh)
+            details=gathers and self._strategy.variance, harmonics=moves_sh,
+            depth_weight=schedule.depth_weight(iteration))
         self._batch.begin(state)
         for _ in range(schedule.config.batch_views):
             view = self._task.pyramid.view(next_view(state, self._task), schedule.level(iteration))

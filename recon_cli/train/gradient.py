@@ -29,14 +29,10 @@ _RADIUS = 5
 _C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
 
 
-# Of the depth of a sensor in the loss, where each pixel counts in units of the sensor's noise
-_DEPTH_WEIGHT = 0.005
-
-
 class GradientStep(Protocol):
     """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of a masked view in an optimizer.
 
-    If the view has sensor depth, that of the rendered depth against it is part of the loss.
+    With `options.depth_weight` that of the depth is added, if a sensor measured it in the view.
     """
 
     @property
@@ -98,7 +94,7 @@ class _FusedStep:
     ) -> tuple[float, Statistics | None]:
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera,
-            _target(view, gain), options)
+            _target(view, gain, options), options)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -125,7 +121,7 @@ class _DeviceStep:
     ) -> Statistics:
         self._compute(
             optimizer.splats.map(lambda tensor: tensor.detach()), optimizer.gradients, view.camera,
-            _target(view, gain), options)
+            _target(view, gain, options), options)
         return self._compute.statistics
 
     def close(self) -> StepReport:
@@ -168,7 +164,7 @@ class _AutogradStep:
             log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
             rgb = rgb * log_gain.exp()
         loss = photometric_loss(rgb, view.pixels(device), options.ssim_weight, mask=counting)
-        target = _target_depth(view)
+        target = _target_depth(view, options)
         if target is not None:
             truth = torch.from_numpy(target.depths).to(output.depth)
             loss = loss + depth_loss(
@@ -183,17 +179,19 @@ class _AutogradStep:
         return value, output.statistics
 
 
-def _target(view: TrainView, gain: NDArray[np.float32] | None) -> TargetImage:
-    return TargetImage(view.image, view.mask, gain, _target_depth(view))
+def _target(
+    view: TrainView, gain: NDArray[np.float32] | None, options: StepOptions
+) -> TargetImage:
+    return TargetImage(view.image, view.mask, gain, _target_depth(view, options))
 
 
-def _target_depth(view: TrainView) -> TargetDepth | None:
-    """Returns the depth that a view is compared with; None where it has none."""
-    if view.depth is None:
+def _target_depth(view: TrainView, options: StepOptions) -> TargetDepth | None:
+    """Returns the depth that a view is compared with; None where it is not, or has none."""
+    if view.depth is None or options.depth_weight == 0:
         return None
     return TargetDepth(
         view.depth.image(view.camera, view.mask), view.depth.noise,
-        _DEPTH_WEIGHT / view.depth.cells)
+        options.depth_weight / view.depth.cells)
 
 
 def photometric_loss(

@@ -37,6 +37,9 @@ def next_iteration(
     if not before or not lately or max(lately) - max(before) >= _GAIN:
         return None
     return final
+# Of sensor depth in the loss, whose unit is the sensor's noise: at the start, where it places the
+# surfaces, and the share that is left at the end, where the images place what is finer than noise.
+_DEPTH_WEIGHT, _DEPTH_END = 0.005, 0.01
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,12 @@ class Schedule:
         done = max(0.0, (self.share(iteration) - start) / (1 - start))
         return float(self.recipe.final_rate**done)
 
+    def depth_weight(self, iteration: int) -> float:
+        """Returns the weight of sensor depth in the loss of a step, 0 where it has no part."""
+        if self.config.depth != "on":
+            return 0.0
+        return float(_DEPTH_WEIGHT * _DEPTH_END ** self.share(iteration))
+
     def moves_sh(self, iteration: int) -> bool:
         """Tells whether the higher degrees are moved in this step."""
         return self.sh_degree(iteration) > 0 and iteration % self.recipe.sh_every == 0
@@ -218,6 +227,10 @@ class ContinuedSchedule(Schedule):
     def means_rate(self, iteration: int) -> float:
         """Returns the learning rate of the means in units of `Task.means_unit`."""
         return self.recipe.means_restart_rate * super().means_rate(iteration)
+
+    def depth_weight(self, iteration: int) -> float:  # noqa: ARG002
+        """Returns the weight at the end of the run before."""
+        return _DEPTH_WEIGHT * _DEPTH_END if self.config.depth == "on" else 0.0
 
     def sh_degree(self, iteration: int) -> int:  # noqa: ARG002
         """Returns the degree in use, which is the highest."""

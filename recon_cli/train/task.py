@@ -57,11 +57,8 @@ class Task:
 
     @cached_property
     def pyramid(self) -> Pyramid:
-        """The training views at every size, with sensor depth if that is part of the loss."""
-        views = self.train
-        if self.schedule.config.depth != "on":
-            views = [replace(view, depth=None) for view in views]
-        return Pyramid(views, page_locked=self.device.type == "cuda")
+        """The training views at every size."""
+        return Pyramid(self.train, page_locked=self.device.type == "cuda")
 
 
 def _in_file(view: TrainView, file: ImageFile | None) -> TrainView:

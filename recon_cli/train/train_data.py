@@ -181,12 +181,11 @@ class MemoryEstimate:
 
 def estimate_memory(
     *, views: int, width: int, height: int, gaussians: int, fused: bool, sh_degree: int = 3,
-    masks: int = 0, depths: int = 0, free: int | None = None,
+    masks: int = 0, free: int | None = None,
 ) -> MemoryEstimate:
     """Returns the memory for views of at most width x height; `fused` means without autograd.
 
-    `masks` and `depths` are the numbers of views with a mask, and maybe with sensor depth. Images
-    that take too much of `free` bytes lie in a file.
+    Images that take too much of `free` bytes lie in a file.
     """
     pixels = width * height
     images = int(_REDUCED * pixels * (3 * views + masks))
@@ -198,8 +197,7 @@ def estimate_memory(
     per_gaussian = 4 * (_COPIES * (_FLOATS + rest) + max(_LARGEST, rest))
     factor = 1 if fused else _TORCH_FACTOR
     return MemoryEstimate(
-        images=images + depths * MOST_SAMPLES * SAMPLE_BYTES,
-        pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
+        images=images, pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,
         gaussians=gaussians * per_gaussian,
         gaussian_buffers=factor * gaussians * _BUFFERS_PER_GAUSSIAN, program=_PROGRAM,
         in_file=in_file)
@@ -257,12 +255,14 @@ def _memory(
     views = (*scene.train, *scene.validation)
     width, height = view_files.sizes_of(
         [fit_camera(view.camera, config.max_size) for view in views])[0]
-    return estimate_memory(
+    needed = estimate_memory(
         views=len(views), width=width, height=height, gaussians=gaussians,
         fused=ctx.backend == "numba", sh_degree=config.sh_degree,
-        masks=sum(view.mask is not None for view in views),
-        depths=0 if scene.depth is None or config.depth == "off" else len(scene.train),
-        free=_host_bytes(ctx))
+        masks=sum(view.mask is not None for view in views), free=_host_bytes(ctx))
+    if scene.depth is None or config.depth == "off":
+        return needed
+    return dataclasses.replace(
+        needed, images=needed.images + len(scene.train) * MOST_SAMPLES * SAMPLE_BYTES)
 
 
 def _free_bytes(ctx: StageContext) -> int:

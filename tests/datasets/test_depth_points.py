@@ -105,3 +105,28 @@ def test_points_of_a_room_lie_on_the_surfaces_that_other_views_see(shared_data):
         off.append(np.abs(depth[y[seen], x[seen]] - camera[seen, 2]))
     # Points that another view cannot see are far off, and still fewer than half of all.
     assert np.median(np.concatenate(off)) < 0.01
+
+
+@pytest.mark.parametrize("change", [
+    lambda depth: 2 * depth, lambda depth: depth / 3, lambda depth: depth[::-1]],
+    ids=["too large a unit", "too small a unit", "rows upside down"])
+def test_depth_that_does_not_fit_the_poses_is_refused(shared_data, change):
+    posed = read_replica(shared_data / "rooms" / "office")
+    posed = replace(posed, images=tuple(replace(
+        image, depth=image.depth and (lambda depth=image.depth: change(depth())))
+        for image in posed.images))
+    with pytest.raises(InputError, match="does not fit together") as caught:
+        points_from_depth(posed)
+    assert "unit of the depth" in caught.value.hint
+
+
+def test_noise_is_no_disagreement(shared_data):
+    rng = np.random.default_rng(0)
+    posed = read_replica(shared_data / "rooms" / "office")
+
+    def noisy(depth):
+        return lambda: depth() * rng.normal(1, 0.03, (340, 600)).astype(np.float32)
+
+    posed = replace(posed, images=tuple(replace(
+        image, depth=image.depth and noisy(image.depth)) for image in posed.images))
+    assert len(points_from_depth(posed, max_points=1000)[0]) > 500

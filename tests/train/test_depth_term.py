@@ -16,7 +16,6 @@ from recon_cli.render.contract import StepOptions
 from recon_cli.render.depth_loss import depth_loss
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.train_view import SensorDepth, TrainView
-from recon_cli.train import gradient
 from recon_cli.train.feature_trials import examine
 from recon_cli.train.fit import fit
 from recon_cli.train.gradient import gradient_step, photometric_loss
@@ -26,6 +25,7 @@ from recon_cli.train.state import new_state
 
 # Gradients of float32 against float64, relative in the 2-norm, as in test_gradient.
 TOLERANCE = 1e-5
+WEIGHT = 0.005
 CAMERA = camera_at(60, 41)
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 
@@ -52,7 +52,8 @@ def depths_with_holes():
 
 def step_on(splats, view, backend, gain=None):
     state = new_state(splats, RunConfig(iterations=10, max_gaussians=300), 1.0, backend=backend)
-    loss, _ = gradient_step(backend)(state.optimizer, view, StepOptions(3, 0.2), gain)
+    loss, _ = gradient_step(backend)(
+        state.optimizer, view, StepOptions(3, 0.2, depth_weight=WEIGHT), gain)
     held = state.optimizer.gradients.parameters().items()
     if not state.optimizer.fused:
         held = ((name, leaf.grad) for name, leaf in state.splats.parameters().items())
@@ -67,7 +68,7 @@ def exact(splats, view):
     truth = torch.from_numpy(view.depth.image(view.camera, view.mask)).double()
     loss = photometric_loss(
         out.rgb, torch.from_numpy(view.image).double() / 255, 0.2, mask=counting) + depth_loss(
-        out.depth, out.alpha, truth, view.depth.noise, gradient._DEPTH_WEIGHT / view.depth.cells)
+        out.depth, out.alpha, truth, view.depth.noise, WEIGHT / view.depth.cells)
     loss.backward()
     return loss.item(), {name: leaf.grad for name, leaf in leaves.parameters().items()}
 

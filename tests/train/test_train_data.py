@@ -90,8 +90,3 @@ def test_as_many_gaussians_fit_as_there_is_room_for_and_no_more(fused):
     with pytest.raises(TrainingError):
         refuse_what_does_not_fit(needed(gaussians=most + 1, fused=fused), free)
     assert gaussians_within(one, 1000) == 0
-
-
-def test_sensor_depth_takes_a_tenth_of_a_megabyte_or_two_a_view():
-    without, with_it = needed(), needed(depths=100)
-    assert 10e6 < with_it.total - without.total < 20e6

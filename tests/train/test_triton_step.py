@@ -15,12 +15,12 @@ from recon_cli.render.contract import StepOptions
 from recon_cli.render.depth_loss import depth_loss
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.train_view import SensorDepth, TrainView
-from recon_cli.train.gradient import _DEPTH_WEIGHT, gradient_step, photometric_loss
+from recon_cli.train.gradient import gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 
 pytest.importorskip("triton", reason="triton is not installed")
 CAMERA = camera_at(24, 18)
-DEGREE, WEIGHT = 3, 0.2
+DEGREE, WEIGHT, DEPTH_WEIGHT = 3, 0.2, 0.005
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-6, 1e-4
 GAIN = np.array([0.8, 1.1, 1.3], np.float32)
 SEEN = random_splats(30, seed=3).map(torch.Tensor.float)
@@ -57,7 +57,7 @@ def exact(splats, view, gain=None):
     if view.depth is not None:
         known = torch.from_numpy(view.depth.image(view.camera, view.mask)).double()
         loss = loss + depth_loss(out.depth, out.alpha, known, view.depth.noise,
-                                 _DEPTH_WEIGHT / view.depth.cells)
+                                 DEPTH_WEIGHT / view.depth.cells)
     loss.backward()
     return loss.item(), leaves, log_gain.grad, out.statistics
 
@@ -101,7 +101,8 @@ def test_a_step_with_sensor_depth_and_those_before_and_after_without_it():
     for view in views:
         optimizer = SplatOptimizer(
             SEEN.map(lambda tensor: tensor.clone().to(DEVICE)), CONFIG, 1.0, backend="triton")
-        loss, _ = compute(optimizer, view, StepOptions(DEGREE, WEIGHT))
+        loss, _ = compute(
+            optimizer, view, StepOptions(DEGREE, WEIGHT, depth_weight=DEPTH_WEIGHT))
         true_loss, leaves, *_ = exact(SEEN, view)
         assert loss == pytest.approx(true_loss, abs=LOSS_TOLERANCE)
         for name, leaf in leaves.parameters().items():
