@@ -97,7 +97,9 @@ class AsyncTrainer:
         for _ in range(schedule.config.batch_views):
             view = self._task.pyramid.view(next_view(state, self._task), schedule.level(iteration))
             statistics = self._compute.start(state.optimizer, view, options)
-            self._batch.add(state, statistics if gathers else None, view.camera, moves_sh=moves_sh)
+            plain = view.depth is None or not options.depth_weight
+            self._batch.add(state, statistics if gathers and plain else None, view.camera,
+                            moves_sh=moves_sh)
         counted = self._batch.end(state, gathers=gathers, moves_sh=moves_sh)
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=moves_sh,

@@ -7,6 +7,7 @@ images alive; the closed form keeps nine.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 _SIGMA = 1.5
 _RADIUS = 5
 _C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
+# Relative, of a rendered depth: it is a mean of those of the centres of Gaussians, which lie before
+# and behind the surface. Without it, sensors of 1% cost .3 to .9 dB (two rooms).
+RENDERED_NOISE = 0.05
 
 
 class GradientStep(Protocol):
@@ -190,7 +194,7 @@ def _target_depth(view: TrainView, options: StepOptions) -> TargetDepth | None:
     if view.depth is None or options.depth_weight == 0:
         return None
     return TargetDepth(
-        view.depth.image(view.camera, view.mask), view.depth.noise,
+        view.depth.image(view.camera, view.mask), math.hypot(view.depth.noise, RENDERED_NOISE),
         options.depth_weight / view.depth.cells)
 
 

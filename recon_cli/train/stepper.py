@@ -79,7 +79,7 @@ class Stepper:
             statistics = self._look(view, index, place, result, iteration)
             if statistics is None:
                 continue
-            if gathers:
+            if gathers and (view.depth is None or not task.schedule.depth_weight(iteration)):
                 gathered.add(
                     statistics, view.camera.width, view.camera.height,
                     variance=self._strategy.variance)

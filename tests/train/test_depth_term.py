@@ -18,9 +18,9 @@ from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.train_view import SensorDepth, TrainView
 from recon_cli.train.feature_trials import examine
 from recon_cli.train.fit import fit
-from recon_cli.train.gradient import gradient_step, photometric_loss
+from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_loss
 from recon_cli.train.initialize import first_state as begin_at
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.schedule import Schedule, make_schedule
 from recon_cli.train.state import new_state
 
 # Gradients of float32 against float64, relative in the 2-norm, as in test_gradient.
@@ -68,7 +68,8 @@ def exact(splats, view):
     truth = torch.from_numpy(view.depth.image(view.camera, view.mask)).double()
     loss = photometric_loss(
         out.rgb, torch.from_numpy(view.image).double() / 255, 0.2, mask=counting) + depth_loss(
-        out.depth, out.alpha, truth, view.depth.noise, WEIGHT / view.depth.cells)
+        out.depth, out.alpha, truth, np.hypot(view.depth.noise, RENDERED_NOISE),
+        WEIGHT / view.depth.cells)
     loss.backward()
     return loss.item(), {name: leaf.grad for name, leaf in leaves.parameters().items()}
 
@@ -191,3 +192,15 @@ def test_depth_that_does_not_fit_the_model_is_off_and_says_why():
     assert needs.config.depth == "off"
     assert [one.reason for one in needs.decisions if one.name == "depth"] == [
         "it differs from the points of the model by 31%"]
+
+
+def test_the_weight_falls_over_the_run_and_leaves_every_other_step_to_the_images():
+    schedule = Schedule(RunConfig(iterations=1000, depth="on"))
+    weights = [schedule.depth_weight(step) for step in range(1, 1001)]
+    assert not any(weights[::2])
+    assert weights[1] > 10 * weights[-1] > 0
+    assert sorted(weights[1::2], reverse=True) == weights[1::2]
+    assert not any(Schedule(RunConfig(iterations=1000, depth=word)).depth_weight(2)
+                   for word in ("auto", "off"))
+    later = make_schedule(RunConfig(iterations=1200, depth="on"), 1000)
+    assert later.depth_weight(1002) == pytest.approx(weights[-1])

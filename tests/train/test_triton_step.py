@@ -15,7 +15,7 @@ from recon_cli.render.contract import StepOptions
 from recon_cli.render.depth_loss import depth_loss
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.train_view import SensorDepth, TrainView
-from recon_cli.train.gradient import gradient_step, photometric_loss
+from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 
 pytest.importorskip("triton", reason="triton is not installed")
@@ -56,7 +56,8 @@ def exact(splats, view, gain=None):
     loss = photometric_loss(out.rgb * log_gain.exp(), truth, WEIGHT, mask=counting)
     if view.depth is not None:
         known = torch.from_numpy(view.depth.image(view.camera, view.mask)).double()
-        loss = loss + depth_loss(out.depth, out.alpha, known, view.depth.noise,
+        noise = np.hypot(view.depth.noise, RENDERED_NOISE)
+        loss = loss + depth_loss(out.depth, out.alpha, known, noise,
                                  DEPTH_WEIGHT / view.depth.cells)
     loss.backward()
     return loss.item(), leaves, log_gain.grad, out.statistics
