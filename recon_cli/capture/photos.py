@@ -9,18 +9,21 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from recon_cli.capture.depth_pictures import look_like_depth
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
 from recon_cli.capture.panoramas import choose_projection
 from recon_cli.capture.photo_tree import VIDEO_SUFFIXES
 from recon_cli.capture.picture_names import picture_kind
 from recon_cli.errors import InputError, list_names
+from recon_cli.io.views import evenly_spread
 
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 _COLOURED = frozenset({"RGB", "RGBA", "RGBX", "P", "PA", "CMYK", "YCbCr", "LAB", "HSV"})
 _DEPTH = "depth maps"
 _NEVER = (_DEPTH, "confidence maps")  # of one channel and with such a name, they are never photos
 _NAMED = 4
+_LOOKED_AT = 8  # pictures of one channel, evenly spread, that tell what all of them show
 # Focal lengths that agree this well are one setting of the lens: EXIF rounds to a tenth of a mm.
 SAME_FOCAL = 0.01
 
@@ -63,8 +66,9 @@ def choose_pictures(
 ) -> tuple[PhotoFolder, list[str]]:
     """Returns the photos of one projection, without depth maps, masks and labels, and notices.
 
-    Depth maps have one channel of 16 bits, where the others have colours. `camera` is that of
-    IngestConfig. InputError where nothing but depth maps, or too little of a projection, is left.
+    Depth maps have one channel of 16 bits, where the others have colours or where they are as dark
+    or smooth as no photo is. `camera` is that of IngestConfig. InputError where nothing but depth
+    maps, or too little of a projection, is left.
     """
     rest, notices = _drop_depth_and_masks(folder, found.photos)
     chosen = choose_projection(folder.name, rest, camera)
@@ -82,7 +86,9 @@ def _drop_depth_and_masks(
     kinds = {photo: _other_kind(photo) for photo in photos}
     coloured = sum(photo.mode in _COLOURED for photo in photos)
     depth_alone = bool(photos) and set(kinds.values()) == {_DEPTH}
-    if depth_alone and picture_kind(folder.resolve().name) == _DEPTH:
+    deep = [photo for photo in photos if kinds[photo] == _DEPTH]
+    shows_depth = look_like_depth([photo.path for photo in evenly_spread(deep, _LOOKED_AT)])
+    if depth_alone and (shows_depth or picture_kind(folder.resolve().name) == _DEPTH):
         raise InputError(
             f"{folder} holds {len(photos)} depth maps (one channel of 16 bits), not photos.",
             hint="Give the folder of the photos that belong to them, or that of both: recon "
@@ -93,7 +99,8 @@ def _drop_depth_and_masks(
         names = [photo.name for photo in photos if kinds[photo] == kind]
         if coloured < max(MIN_FRAMES, len(names) / 2):  # gray photos, and a few others
             names = [photo.name for photo in photos if kinds[photo] == kind and kind in _NEVER
-                     and picture_kind(photo.path.stem) == kind]
+                     and (picture_kind(photo.path.stem) == kind
+                          or (kind == _DEPTH and shows_depth))]
         if not names:
             continue
         dropped.update(names)

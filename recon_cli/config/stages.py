@@ -220,6 +220,10 @@ class TrainConfig(StageConfig):
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
         choices=("auto", "on", "off"))
+    depth: str = option(
+        "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
+        "budget, unless a trial shows a loss.",
+        choices=("auto", "on", "off"), late=True, expert=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -313,7 +317,7 @@ class RunConfig(SettledConfig):
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
                  "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
                  "sh_rate")
-        return self.densify == "reference" and all(
+        return self.densify == "reference" and self.depth != "on" and all(
             getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 

@@ -70,7 +70,7 @@ _PAPER_PRUNE = MidPrune(
 
 # 3DGS has no optional parts; the training images are chosen for all variants alike
 _PLAIN = {"densify": "reference", "far": "off", "stereo": "off", "exposure": "off",
-          "max_radius": 0.0}
+          "depth": "off", "max_radius": 0.0}
 REFERENCE = Variant("reference", "3DGS", _PLAIN)
 PAPER = Variant("paper", "paper", _PLAIN, _PAPER_PRUNE)
 BUDGET = Variant("budget", "ours", {"densify": "budget"}, tries_degree=True)

@@ -106,6 +106,6 @@ class FormatWriter:
         """The mesh of all formats that have it, measured if there is a plan."""
         source, measured = self._source, self._room_frame is not None
         return build_mesh(
-            self._splats.map(lambda tensor: tensor.to(source.ctx.device)), source.load_training(),
-            source.points if measured else None, source.ctx,
+            self._splats.map(lambda tensor: tensor.to(source.ctx.device)),
+            source.load_training_with_depth(), source.points if measured else None, source.ctx,
             max_triangles=self._config.max_triangles, voxel=self._config.voxel)

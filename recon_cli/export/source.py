@@ -16,7 +16,9 @@ from recon_cli.export.coordinate_frame import ExportFrame
 from recon_cli.export.page import make_guide
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
+from recon_cli.io.sensor_depth import ALL_SAMPLES, read_sensor_depth
 from recon_cli.io.training_scene import load_scene
+from recon_cli.io.views import ReferenceView
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.scene.splats import Splats, transformed
@@ -72,7 +74,21 @@ class ExportSource:
     def load_training(self) -> list[TrainView]:
         """Returns the training views with their images."""
         return [dataclasses.replace(view, camera=self._similarity.camera(view.camera))
-                for view in load_views(self.scene.train, self._run_config, self.ctx)]
+                for view in self._load_views()]
+
+    def load_training_with_depth(self) -> list[TrainView]:
+        """Returns the training views with their images, and with all sensor depth that fits."""
+        sensor = read_sensor_depth(self.scene, most_samples=ALL_SAMPLES)
+        if sensor.refused:
+            self.ctx.notice(f"sensor depth is not used for the mesh: {sensor.refused}")
+        scaled = {name: dataclasses.replace(depth, depths=np.float32(self.scale) * depth.depths)
+                  for name, depth in sensor.depths.items()}
+        return [dataclasses.replace(
+            view, camera=self._similarity.camera(view.camera), depth=scaled.get(view.name))
+            for view in self._load_views()]
+
+    def _load_views(self) -> list[ReferenceView]:
+        return load_views(self.scene.train, self._run_config, self.ctx)
 
     def place(self, views: Sequence[View]) -> list[tuple[str, Camera]]:
         """Returns views by name, with their cameras in the world of the files."""

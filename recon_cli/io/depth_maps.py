@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, ManifestError
+from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.images import decode_file, write_png
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace import atomic
@@ -26,6 +27,12 @@ DEPTH, LIST = "depth", "depth.json"
 _MOST = 65535  # value of 16 bits
 _WHOLE = 0.02  # of a unit: what float32 leaves of a multiple
 _CONFIDENCE = ".confidence.png"
+SURE = 2  # level of confidence, of 0 to 2
+# Relative noise at the points of a model, beyond which depth is not of this model, or tells less
+# than the images: phones have about .01, cheap cameras .03.
+MOST_NOISE = 0.1
+# Relative difference of neighbouring depths that is an edge, beside which depth is of nothing.
+EDGE = 0.05
 
 
 @dataclass(frozen=True)
@@ -93,6 +100,29 @@ def read_depth(
     depth = _read(path, shape).astype(np.float64) * one.unit
     levels = _read(_confidence(path), shape) if one.confidence else None
     return depth.astype(np.float32), None if levels is None else np.asarray(levels, np.uint8)
+
+
+def read_sure_depth(ingest: Path, name: str, one: DepthMap) -> NDArray[np.float32]:
+    """Returns the depth [h, w] of a frame in world units, 0 where it is not sure or too far."""
+    depth, levels = read_depth(ingest, name, one)
+    if levels is not None:
+        depth[levels < SURE] = 0
+    if one.reliable is not None:
+        depth[depth > one.reliable] = 0
+    return depth
+
+
+def lens_camera(lens: Lens) -> pycolmap.Camera:
+    """Returns the camera of a lens, as of a depth map."""
+    return pycolmap.Camera(
+        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+
+
+def find_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Returns where depth differs much from that of a neighbour, or one is unknown, [H, W]."""
+    kernel = np.ones((3, 3), np.uint8)
+    high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
+    return np.asarray(high - low > EDGE * depth)
 
 
 def _read(path: Path, shape: tuple[int, int]) -> NDArray[np.generic]:

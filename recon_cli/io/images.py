@@ -156,4 +156,5 @@ def reduce_view(view: TrainView, factor: float) -> TrainView:
         hidden = (~view.mask).astype(np.float32)
         # a reduced pixel counts only where all that it covers counts
         mask = np.asarray(cv2.resize(hidden, (width, height), interpolation=cv2.INTER_AREA) == 0)
-    return TrainView(camera.resized(width, height), np.ascontiguousarray(image), mask)
+    return TrainView(
+        camera.resized(width, height), np.ascontiguousarray(image), mask, depth=view.depth)

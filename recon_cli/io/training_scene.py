@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from recon_cli.io import depth_maps
 from recon_cli.io.colmap import read_scene
 from recon_cli.scene.scene import Scene
 from recon_cli.workspace.records import read_frame_list
@@ -32,4 +33,6 @@ def load_scene(
         sfm / "undistorted", held_out=held_out, validation=validation, sparse=sparse)
     world = WorldSummary.read(sfm)
     up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
-    return dataclasses.replace(scene, up=up)
+    ingest = folders["ingest"]
+    return dataclasses.replace(
+        scene, up=up, depth=ingest if (ingest / depth_maps.LIST).exists() else None)

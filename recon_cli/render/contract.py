@@ -106,12 +106,22 @@ class RenderOutput:
 
 
 @dataclass(frozen=True, eq=False)
+class TargetDepth:
+    """The depth that a training step compares the rendered one with; see `render.depth_loss`."""
+
+    depths: NDArray[np.float32]  # [H, W] world units, 0 where it is not known
+    noise: float  # relative standard deviation
+    factor: float  # of the loss of each pixel
+
+
+@dataclass(frozen=True, eq=False)
 class TargetImage:
     """The image that a training step compares a rendered view with."""
 
     pixels: NDArray[np.uint8]  # [H, W, 3]
     mask: NDArray[np.bool_] | None = None  # [H, W] True where a pixel counts; None: everywhere
     gain: NDArray[np.float32] | None = None  # [3] factors of the rendered channels; None for ones
+    depth: TargetDepth | None = None  # None where depth is not part of the loss
 
 
 @dataclass(frozen=True)
@@ -124,6 +134,7 @@ class StepOptions:
     scores: bool = False  # hits and blend weights too, over the mask; else they mean nothing
     loo: bool = False  # likewise
     harmonics: bool = True  # without, the gradient of sh_rest may be left as it is
+    depth_weight: float = 0.0  # of the mean over what a sensor measured, in the loss
 
 
 class Renderer(Protocol):

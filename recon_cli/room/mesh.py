@@ -25,6 +25,7 @@ from recon_cli.room.depth_maps import DepthMaps, render_depth_maps, weigh_by_agr
 from recon_cli.room.kernels import SEEN_THROUGH, SHOWN, observe
 from recon_cli.room.mesh_planes import surface_planes
 from recon_cli.room.planes import Plane
+from recon_cli.room.sensor_depths import with_sensor
 from recon_cli.room.stereo_depths import with_stereo
 from recon_cli.room.volume import BYTES, extract, find_blocks, fuse
 from recon_cli.scene.splats import Splats
@@ -68,7 +69,7 @@ def build_mesh(
 
     Args:
         splats: on the device of `ctx`.
-        views: at least one, with cameras in the world of the splats.
+        views: at least one, with cameras in the world of the splats, and sensor depth in its units.
         points: [P, 3] triangulated points, which confirm the planes that a room is measured by;
             None if it is not measured.
         ctx: backend, threads, progress, and notices.
@@ -86,6 +87,7 @@ def build_mesh(
     if len(views) > 1:
         means = splats.means.detach().cpu().numpy().astype(np.float64)
         maps = with_stereo(maps, (means.min(axis=0), means.max(axis=0)), ctx.progress)
+    maps = with_sensor(maps)
     with ctx.progress.bar("mesh", len(maps.views), unit="view") as bar:
         return mesh_of(maps, points, ctx, max_triangles=max_triangles, voxel=voxel,
                        on_view=bar.advance)

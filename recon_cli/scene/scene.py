@@ -47,6 +47,7 @@ class Scene:
     colors: NDArray[np.uint8]  # [P, 3] uint8 their RGB colours
     up: NDArray[np.float64] | None = None  # [3] unit vector; None where it is not known
     sparse: Path | None = None  # folder of the COLMAP model that all of it was read from
+    depth: Path | None = None  # folder of ingest, where it has sensor depth
     cell: Cell | None = None  # the part that is modelled, of a block of a larger scene; None: all
 
     @property

@@ -21,6 +21,33 @@ BORDER = MIN_SIDE // 2  # pixels; what SSIM leaves out, where the window reaches
 
 
 @dataclass(frozen=True, eq=False)
+class SensorDepth:
+    """Depth that a sensor measured in a view, where it is sure: K samples of its map."""
+
+    rays: NDArray[np.float32]  # [K, 2] x / z and y / z in the axes of the camera
+    depths: NDArray[np.float32]  # [K] z, world units
+    noise: float  # relative standard deviation of the depths
+    cells: int  # samples of the map that lie in the image, known or not
+
+    def image(
+        self, camera: Camera, mask: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float32]:
+        """Returns the depths at their pixels in an image of the view, [H, W], else 0.
+
+        `camera` may have any size; of several samples in a pixel one is taken, and none where
+        `mask` [H, W] is False.
+        """
+        column = np.floor(self.rays[:, 0] * camera.fx + camera.cx).astype(np.int64)
+        row = np.floor(self.rays[:, 1] * camera.fy + camera.cy).astype(np.int64)
+        inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        image = np.zeros((camera.height, camera.width), np.float32)
+        image[row[inside], column[inside]] = self.depths[inside]
+        if mask is not None:
+            image[~mask] = 0
+        return image
+
+
+@dataclass(frozen=True, eq=False)
 class TrainView:
     """One view in the form that training reads."""
 
@@ -28,6 +55,7 @@ class TrainView:
     stored: NDArray[np.uint8]  # the image, [H, W, 3]; one colour under the mask (`fill_masked`)
     mask: NDArray[np.bool_] | None = None  # [H, W], True where a pixel counts; None where all do
     file: ImageFile | None = field(default=None, kw_only=True)  # in which the image lies, if in any
+    depth: SensorDepth | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.mask is not None and self.mask.shape != self.stored.shape[:2]:
@@ -50,7 +78,8 @@ class TrainView:
         import torch
 
         mask = None if self.mask is None else torch.from_numpy(self.mask).pin_memory().numpy()
-        return TrainView(self.camera, torch.from_numpy(self.image).pin_memory().numpy(), mask)
+        return TrainView(
+            self.camera, torch.from_numpy(self.image).pin_memory().numpy(), mask, depth=self.depth)
 
     def pixels(self, device: torch.device) -> Tensor:
         """Returns the image as float32 in [0, 1], [H, W, 3]."""

@@ -6,16 +6,21 @@ others. Depth that is far or not sure is left out, and so is what a single frame
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.io.depth_maps import DepthMap, read_depth_list
+from recon_cli.io.depth_maps import (
+    DepthMap,
+    find_edges,
+    lens_camera,
+    read_depth_list,
+    read_sure_depth,
+)
 from recon_cli.io.images import read_png
-from recon_cli.sfm.scale_evidence import lens_camera, read_sure_depth
 
 MOST_MAPS = 100  # evenly spread
 SAMPLES = 8000  # of each map
@@ -23,19 +28,19 @@ SAMPLES = 8000  # of each map
 # points of dense stereo.
 CELL = 1 / 50
 AGREE = 2  # frames that show a surface in a cell
-# Relative difference of neighbouring depths that is an edge, beside which depth is of nothing.
-EDGE = 0.05
 _HALF = 1 << 20  # cells on each side of the origin
 
 
 def add_depth_points(
-    model: pycolmap.Reconstruction, ingest: Path, frames: Path, metres: float
+    model: pycolmap.Reconstruction, ingest: Path, frames: Path, metres: float, *,
+    without: Collection[str] = (),
 ) -> int:
     """Adds points to a model, in place, by the depth maps of ingest; returns how many.
 
-    `metres` is the length of a unit of the model. FormatError if a map or frame is damaged.
+    `metres` is the length of a unit of the model, `without` the names of frames that are held out.
+    FormatError if a map or frame is damaged.
     """
-    maps = read_depth_list(ingest)
+    maps = {name: one for name, one in read_depth_list(ingest).items() if name not in without}
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     names = sorted(set(maps) & set(images))
     count = min(len(names), MOST_MAPS)
@@ -59,12 +64,12 @@ def _unproject(
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
     """Returns points [P, 3] of a depth map in the model's world, colours [P, 3] and depths [P]."""
     depth = read_sure_depth(ingest, image.name, one)
-    depth[_edges(depth)] = 0
+    depth[find_edges(depth)] = 0
     step = max(1, round((depth.size / SAMPLES) ** 0.5))
     rows, columns = np.nonzero(depth[step // 2::step, step // 2::step])
     rows, columns = rows * step + step // 2, columns * step + step // 2
     z = depth[rows, columns].astype(np.float64) / metres
-    rays = np.asarray(lens_camera(one).cam_from_img(np.column_stack([columns, rows]) + 0.5))
+    rays = np.asarray(lens_camera(one.lens).cam_from_img(np.column_stack([columns, rows]) + 0.5))
     local = np.column_stack([rays.reshape(-1, 2) * z[:, None], z])
     rgb = read_png(frames / image.name)
     pixels = np.nan_to_num(np.asarray(image.camera.img_from_cam(local)).reshape(-1, 2), nan=-1)
@@ -72,13 +77,6 @@ def _unproject(
     x, y = pixels[inside].astype(np.intp).T
     world = np.asarray(image.cam_from_world().inverse() * local[inside])
     return world.reshape(-1, 3), rgb[y, x], z[inside]
-
-
-def _edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns where depth differs much from that of a neighbour, or one is unknown, [H, W]."""
-    kernel = np.ones((3, 3), np.uint8)
-    high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
-    return np.asarray(high - low > EDGE * depth)
 
 
 def _choose(

@@ -166,6 +166,7 @@ def _start_from(
     both = [name for name in mapper.list_registered(model) if name in start]
     given = np.stack([start[name] for name in both])
     model.transform(align_to_given(_viewmats(model, both), given))
+    model.extract_colors_for_all_images(job.frames, job.threads)  # which only mappers do
     moved = measure_movement(_viewmats(model, both), given)
     return _write(job, model, verdict, notes, PosesSummary(
         use=job.pose_use, metric=known.metric, held=len(found.held),

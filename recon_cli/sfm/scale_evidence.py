@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.io.depth_maps import DepthMap, read_depth, read_depth_list
+from recon_cli.io.depth_maps import MOST_NOISE, lens_camera, read_depth_list, read_sure_depth
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.sfm.job import MappingJob, StepLog
 from recon_cli.sfm.results import ModelResult
@@ -37,7 +37,8 @@ TRACKED_ERROR, DEPTH_ERROR = 0.003, 0.005
 MAX_TURN_DEG, MAX_TURN_SHARE, MAX_LENGTH_SHARE = 2.0, 0.1, 0.2
 MOST_DEPTH_MAPS = 40  # evenly spread
 FEWEST_DEPTHS = 20  # points of a frame
-SURE = 2  # level of confidence, of 0 to 2
+_UNFIT = ("Sensor depth gives neither scale nor points: few points of the model have some, or it "
+          "differs from them.")
 MAX_UP_SPREAD_DEG = 5.0  # median angle of up, by single frames, to the mean of all
 
 
@@ -49,6 +50,7 @@ class DeviceEvidence:
     axes_open: bool = True  # up is to be found; else the axes stay
     up: tuple[float, float, float] | None = None  # in the model, where it is known
     sources: tuple[ScaleSource, ...] = ()
+    remark: str = ""  # a sentence, where depth is not used
 
     @property
     def depth_scale(self) -> float | None:
@@ -75,10 +77,13 @@ def ask_device(
         sources = [source for source in (
             scale_from_poses(viewmats, known.viewmats),
             scale_from_depth(model, job.poses.parent)) if source is not None]
+    fits = any(source.name == DEPTH for source in sources)
+    remark = _UNFIT if known.metric and not fits and read_depth_list(job.poses.parent) else ""
     if refuted:
-        return DeviceEvidence(sources=tuple(sources))
+        return DeviceEvidence(sources=tuple(sources), remark=remark)
     up = None if known.up is None else up_from_poses(viewmats, known.viewmats, known.up)
-    return DeviceEvidence(known.metric, known.find_up or known.up is not None, up, tuple(sources))
+    return DeviceEvidence(
+        known.metric, known.find_up or known.up is not None, up, tuple(sources), remark)
 
 
 def scale_from_poses(found: Viewmats, tracked: Viewmats) -> ScaleSource | None:
@@ -174,13 +179,14 @@ def up_from_poses(
 def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSource | None:
     """Returns the metres of a unit of a model, by the depth maps of ingest, which are in metres.
 
-    None without enough depth at points of the model. FormatError if a map is damaged.
+    None without enough depth at points of the model, or if it does not fit them. FormatError if a
+    map is damaged.
     """
     maps = read_depth_list(ingest)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     names = sorted(set(maps) & set(images))
     count = min(len(names), MOST_DEPTH_MAPS)
-    ratios = []
+    ratios, every = [], []
     for name in (names[int((at + 0.5) * len(names) / count)] for at in range(count)):
         one = maps[name]
         depth = read_sure_depth(ingest, name, one)
@@ -188,38 +194,26 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
         if not len(pixels):
             continue
         rays = np.asarray(images[name].camera.cam_from_img(pixels))
-        at = np.asarray(lens_camera(one).img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+        at = np.asarray(lens_camera(one.lens).img_from_cam(
+            np.column_stack([rays, np.ones(len(rays))])))
         at = np.nan_to_num(at, nan=-1.0)
         inside = ((at >= 0) & (at < (one.lens.width, one.lens.height))).all(axis=1)
         column, row = at[inside].astype(np.intp).T
         theirs = depth[row, column].astype(np.float64)
         known = theirs > 0
         if known.sum() >= FEWEST_DEPTHS:
-            ratios.append(float(np.median(theirs[known] / ours[inside][known])))
+            every.append(theirs[known] / ours[inside][known])
+            ratios.append(float(np.median(every[-1])))
     if len(ratios) < FEWEST_BLOCKS:
         return None
     scale = float(np.median(ratios))
+    noise = 1.4826 * float(np.median(np.abs(np.concatenate(every) / scale - 1)))
+    if noise > MOST_NOISE:
+        return None
     spread = 1.4826 * float(np.median(np.abs(np.array(ratios) / scale - 1)))
     # of a median: 1.25 times that of a mean
     error = 1.25 * spread / np.sqrt(len(ratios))
     return ScaleSource(DEPTH, scale, float(np.hypot(error, DEPTH_ERROR)))
-
-
-def read_sure_depth(ingest: Path, name: str, one: DepthMap) -> NDArray[np.float32]:
-    """Returns the depth [h, w] of a frame in world units, 0 where it is not sure or too far."""
-    depth, levels = read_depth(ingest, name, one)
-    if levels is not None:
-        depth[levels < SURE] = 0
-    if one.reliable is not None:
-        depth[depth > one.reliable] = 0
-    return depth
-
-
-def lens_camera(one: DepthMap) -> pycolmap.Camera:
-    """Returns the camera of a depth map."""
-    lens = one.lens
-    return pycolmap.Camera(
-        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
 
 
 def _seen_depths(

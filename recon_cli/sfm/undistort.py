@@ -6,6 +6,7 @@ result lies outside the frame (blank_pixels = 0): a model learns no black border
 
 from __future__ import annotations
 
+import dataclasses
 import filecmp
 import shutil
 from collections import Counter
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
+from recon_cli.io.training_scene import held_out_names
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.sfm.align_world import refuse_contradiction, world_transform
 from recon_cli.sfm.depth_points import add_depth_points
@@ -52,7 +54,9 @@ def place_model(job: MappingJob) -> PlacedResult:
                 for name, image in images.items()}
     device = ask_device(job, model, viewmats)
     if device.depth_scale is not None and job.pose_use != "keep" and job.poses is not None:
-        add_depth_points(model, job.poses.parent, job.frames, device.depth_scale)
+        ingest = job.poses.parent
+        add_depth_points(model, ingest, job.frames, device.depth_scale,
+                         without=held_out_names(ingest))
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,
         gravity=job.gravity and device.axes_open, given_up=device.up,
@@ -61,6 +65,8 @@ def place_model(job: MappingJob) -> PlacedResult:
         pinholes={name: _pinhole(image.camera) for name, image in images.items()
                   if not is_panorama(image.camera)})
     refuse_contradiction(world.evidence, accepted=job.accept_weak)
+    if device.remark:
+        world = dataclasses.replace(world, sentences=(*world.sentences, device.remark))
     model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")
     write_model(model, folder)

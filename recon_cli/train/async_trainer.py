@@ -91,12 +91,15 @@ class AsyncTrainer:
         gathers, moves_sh = schedule.gathers(iteration), schedule.moves_sh(iteration)
         options = StepOptions(
             schedule.sh_degree(iteration), schedule.config.ssim_weight,
-            details=gathers and self._strategy.variance, harmonics=moves_sh)
+            details=gathers and self._strategy.variance, harmonics=moves_sh,
+            depth_weight=schedule.depth_weight(iteration))
         self._batch.begin(state)
         for _ in range(schedule.config.batch_views):
             view = self._task.pyramid.view(next_view(state, self._task), schedule.level(iteration))
             statistics = self._compute.start(state.optimizer, view, options)
-            self._batch.add(state, statistics if gathers else None, view.camera, moves_sh=moves_sh)
+            plain = view.depth is None or not options.depth_weight
+            self._batch.add(state, statistics if gathers and plain else None, view.camera,
+                            moves_sh=moves_sh)
         counted = self._batch.end(state, gathers=gathers, moves_sh=moves_sh)
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=moves_sh,

@@ -2,7 +2,8 @@
 
 A part has a cheap sign that must speak for it first, then two short runs at a reduced size that
 differ in this part alone are scored on views that neither trained on. A part is off unless the
-trial shows a gain; far content in rooms is on unless it shows a loss. What was switched on is part
+trial shows a gain; far content in rooms, and the depth of a sensor, are on unless it shows a loss.
+What was switched on is part
 of the trials that follow. `tests/bench/bench_trials.py` holds the choices
 against runs of full length.
 """
@@ -113,7 +114,7 @@ _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
-PARTS = ("far", "stereo", "exposure", "images")
+PARTS = ("far", "stereo", "exposure", "images", "depth")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
@@ -173,6 +174,9 @@ def examine(scene: TrialScene) -> Needs:
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
+    if config.depth == "auto" and not (scene.task.has_depth or scene.task.depth_refused):
+        config = replace(config, depth="off")
+    settle("depth", "on" if scene.task.has_depth else None, scene.task.depth_refused)
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
     return Needs(config, tuple(decisions))
@@ -217,7 +221,9 @@ class _Bench:
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
         # and the errors are large, but loses up to .5 dB on all five of things.
-        lenient = part == "far" and not look_at_one_thing(self._scene.task.train)
+        # Depth puts surfaces where they are, which the views of the path need not show.
+        lenient = part == "depth" or (
+            part == "far" and not look_at_one_thing(self._scene.task.train))
         return decide(part, (lambda: scores(without), lambda: scores(with_it)),
                       unless_worse=lenient)
 
@@ -267,7 +273,8 @@ class _Bench:
         scene, task = self._scene, self._scene.task
         train = task.train
         if scene.twins is not None and config.images == "denoised":
-            train, _ = scene.twins()
+            train = [replace(twin, depth=view.depth)
+                     for twin, view in zip(scene.twins()[0], train, strict=True)]
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         # Far content seemed worth up to 1 dB less where a run so short replaced Gaussians, too; in
         # runs of full length it is worth as much as without (tests/bench/notes/training.md).

@@ -7,6 +7,7 @@ images alive; the closed form keeps nine.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render import Statistics, render
-from recon_cli.render.contract import StepOptions, TargetImage
+from recon_cli.render.contract import StepOptions, TargetDepth, TargetImage
+from recon_cli.render.depth_loss import depth_loss
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.optimizer import SplatOptimizer
 
@@ -26,10 +28,16 @@ if TYPE_CHECKING:
 _SIGMA = 1.5
 _RADIUS = 5
 _C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
+# Relative, of a rendered depth: it is a mean of those of the centres of Gaussians, which lie before
+# and behind the surface. Without it, sensors of 1% cost .3 to .9 dB (two rooms).
+RENDERED_NOISE = 0.05
 
 
 class GradientStep(Protocol):
-    """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of a masked view in an optimizer."""
+    """Leaves the gradients of (1 - w) L1 + w (1 - SSIM) of a masked view in an optimizer.
+
+    With `options.depth_weight` that of the depth is added, if a sensor measured it in the view.
+    """
 
     @property
     def log_gain_gradient(self) -> NDArray[np.float64]:
@@ -90,7 +98,7 @@ class _FusedStep:
     ) -> tuple[float, Statistics | None]:
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera,
-            TargetImage(view.image, view.mask, gain), options)
+            _target(view, gain, options), options)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -117,7 +125,7 @@ class _DeviceStep:
     ) -> Statistics:
         self._compute(
             optimizer.splats.map(lambda tensor: tensor.detach()), optimizer.gradients, view.camera,
-            TargetImage(view.image, view.mask, gain), options)
+            _target(view, gain, options), options)
         return self._compute.statistics
 
     def close(self) -> StepReport:
@@ -160,6 +168,11 @@ class _AutogradStep:
             log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
             rgb = rgb * log_gain.exp()
         loss = photometric_loss(rgb, view.pixels(device), options.ssim_weight, mask=counting)
+        target = _target_depth(view, options)
+        if target is not None:
+            truth = torch.from_numpy(target.depths).to(output.depth)
+            loss = loss + depth_loss(
+                output.depth, output.alpha, truth, target.noise, target.factor)
         value = float(loss.detach())
         if not (loss.requires_grad and output.statistics.radii.any()):
             return value, None
@@ -168,6 +181,21 @@ class _AutogradStep:
             if log_gain is not None and log_gain.grad is not None:
                 self.log_gain_gradient = log_gain.grad.cpu().double().numpy()
         return value, output.statistics
+
+
+def _target(
+    view: TrainView, gain: NDArray[np.float32] | None, options: StepOptions
+) -> TargetImage:
+    return TargetImage(view.image, view.mask, gain, _target_depth(view, options))
+
+
+def _target_depth(view: TrainView, options: StepOptions) -> TargetDepth | None:
+    """Returns the depth that a view is compared with; None where it is not, or has none."""
+    if view.depth is None or options.depth_weight == 0:
+        return None
+    return TargetDepth(
+        view.depth.image(view.camera, view.mask), math.hypot(view.depth.noise, RENDERED_NOISE),
+        options.depth_weight / view.depth.cells)
 
 
 def photometric_loss(

@@ -79,7 +79,7 @@ class Stepper:
             statistics = self._look(view, index, place, result, iteration)
             if statistics is None:
                 continue
-            if gathers:
+            if gathers and (view.depth is None or not task.schedule.depth_weight(iteration)):
                 gathered.add(
                     statistics, view.camera.width, view.camera.height,
                     variance=self._strategy.variance)
@@ -103,7 +103,7 @@ class Stepper:
             details=schedule.gathers(iteration) and self._strategy.variance,
             scores=importance is not None and importance.weighs,
             loo=importance is not None and importance.leaves_out,
-            harmonics=schedule.moves_sh(iteration))
+            harmonics=schedule.moves_sh(iteration), depth_weight=schedule.depth_weight(iteration))
         result.loss[place], statistics = self._compute(
             state.optimizer, view, options,
             None if state.exposure is None else state.exposure.gain(index))

@@ -31,6 +31,7 @@ class Task:
     jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
     stereo: StereoPoints | None = None  # of the training views; None where they are not known
+    depth_refused: str = ""  # why no view has sensor depth although the capture has some
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
         """Returns 1 for each position where Gaussians may be added, else 0."""
@@ -48,6 +49,11 @@ class Task:
         if self.schedule.recipe.means_unit == "extent" or self.nearness is None:
             return self.extent
         return self.nearness
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether a sensor measured the depth of any training view."""
+        return any(view.depth is not None for view in self.train)
 
     @cached_property
     def pyramid(self) -> Pyramid:

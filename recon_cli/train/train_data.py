@@ -18,6 +18,12 @@ from recon_cli.errors import ConfigError, FormatError, TrainingError
 from recon_cli.io import views as view_files
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
+from recon_cli.io.sensor_depth import (
+    MOST_SAMPLES,
+    SAMPLE_BYTES,
+    SensorViews,
+    read_sensor_depth,
+)
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.image_file import ImageFile
@@ -55,7 +61,9 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     _refuse_tiny_units(scene)
     file = image_file(ctx) if check_memory(scene, config, ctx).in_file else None
     views = load_views(scene.train, config, ctx, file)
-    train: list[TrainView] = [*views]
+    sensor = load_sensor_depth(scene, config)
+    train: list[TrainView] = [
+        dataclasses.replace(view, depth=sensor.depths.get(view.name)) for view in views]
     if len(train) < 2:
         raise TrainingError(
             f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
@@ -67,7 +75,28 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         train, [*load_views(scene.validation, config, ctx, file)], Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), nearness=nearness, cell=scene.cell,
         stereo=StereoPoints(
-            train, lambda: _sparse_model(scene, [view.name for view in views]), ctx.progress))
+            train, lambda: _sparse_model(scene, [view.name for view in views]), ctx.progress),
+        depth_refused=sensor.refused)
+
+
+def load_sensor_depth(scene: Scene, config: RunConfig) -> SensorViews:
+    """Returns the sensor depth of the training views, none if the options do without.
+
+    Raises:
+        ConfigError: the options ask for it, but there is none that fits.
+    """
+    if config.depth == "off" or (config.depth == "auto" and config.densify == "reference"):
+        return SensorViews()  # 3DGS knows of no depth
+    sensor = read_sensor_depth(scene)
+    if sensor.left_out:
+        logger.info("sensor depth contradicts the model in %d views, and is not used there: %s",
+                    len(sensor.left_out), ", ".join(sensor.left_out))
+    if config.depth == "on" and not sensor.depths and scene.cell is None:
+        raise ConfigError(
+            "depth is on, but " + (f"the sensor depth does not fit: {sensor.refused}."
+                                   if sensor.refused else "no training view has sensor depth."),
+            hint="Leave out --depth on.")
+    return sensor
 
 
 def _sparse_model(scene: Scene, names: Sequence[str]) -> SparseModel:
@@ -129,7 +158,7 @@ def read_config(folder: Path) -> RunConfig:
 class MemoryEstimate:
     """The bytes that a run needs at its peak."""
 
-    images: int  # all views as uint8, and their masks
+    images: int  # all views as uint8, their masks and sensor depth
     pixel_buffers: int  # of one step, for each pixel of a view
     gaussians: int  # parameters, gradients, moments at the largest count
     gaussian_buffers: int  # of one step, for each Gaussian
@@ -226,10 +255,14 @@ def _memory(
     views = (*scene.train, *scene.validation)
     width, height = view_files.sizes_of(
         [fit_camera(view.camera, config.max_size) for view in views])[0]
-    return estimate_memory(
+    needed = estimate_memory(
         views=len(views), width=width, height=height, gaussians=gaussians,
         fused=ctx.backend == "numba", sh_degree=config.sh_degree,
         masks=sum(view.mask is not None for view in views), free=_host_bytes(ctx))
+    if scene.depth is None or config.depth == "off":
+        return needed
+    return dataclasses.replace(
+        needed, images=needed.images + len(scene.train) * MOST_SAMPLES * SAMPLE_BYTES)
 
 
 def _free_bytes(ctx: StageContext) -> int:

@@ -94,7 +94,9 @@ def test_photos_in_folders_are_called_by_their_paths_and_come_after_the_others(t
 def pictures(folder, **kinds):
     """Writes four pictures of each kind, by the first letters of their names."""
     folder.mkdir(exist_ok=True)
-    values = {"I;16": np.full((6, 8), 1500, np.uint16), "L": np.full((6, 8), 200, np.uint8),
+    gray = np.random.default_rng(0).integers(0, 65536, (6, 8)).astype(np.uint16)  # a photo
+    values = {"I;16": gray, "depth": np.full((6, 8), 1500, np.uint16),
+              "L": np.full((6, 8), 200, np.uint8),
               "RGB": np.full((6, 8, 3), 90, np.uint8)}
     for name, mode in kinds.items():
         for index in range(4):
@@ -131,6 +133,26 @@ def test_a_folder_of_depth_maps_holds_no_photos(tmp_path):
     with pytest.raises(InputError, match="holds 4 depth maps") as caught:
         choose(tmp_path / "depth", pictures(tmp_path / "depth", a="I;16"))
     assert f"recon ingest {tmp_path}" in caught.value.hint
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff"])
+@pytest.mark.parametrize("unit", [1000, 6553.5])  # millimetres, and a room over all 16 bits
+def test_depth_maps_alone_are_no_photos_whatever_they_are_called(tmp_path, suffix, unit):
+    row, column = np.mgrid[:48, :64]
+    for index in range(4):  # a floor and a wall
+        z = np.minimum(4.0, 60 / (row + 2 + index)) + 0.01 * column
+        Image.fromarray(np.rint(unit * z).astype(np.uint16)).save(tmp_path / f"{index}.{suffix}")
+    with pytest.raises(InputError, match="holds 4 depth maps"):
+        choose(tmp_path, list_photos(tmp_path.iterdir()).photos)
+
+
+def test_depth_beside_a_single_coloured_picture_is_not_kept(tmp_path):
+    listed = pictures(tmp_path, a="depth")
+    Image.new("RGB", (8, 6)).save(tmp_path / "logo.png")
+    (logo,) = list_photos([tmp_path / "logo.png"]).photos
+    photos, notices = choose(tmp_path, [*listed, logo])
+    assert photos == (logo,)
+    assert "4 pictures are depth maps" in notices[0]
 
 
 @pytest.mark.parametrize(("name", "program"), [("a.webp", "magick"), ("a.png", "ffmpeg")])

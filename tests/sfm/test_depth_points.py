@@ -93,6 +93,19 @@ def test_what_a_single_frame_shows_and_what_the_model_has_gives_no_points(scene)
     assert add_depth_points(model, folder, folder / "frames", METRES) == 0
 
 
+def test_the_depth_of_held_out_frames_is_not_used(scene):
+    model, folder = scene
+    write(folder, flat())
+    assert add_depth_points(model, folder, folder / "frames", METRES, without=NAMES) == 0
+    x = {}
+    for held_out in ((), NAMES[2:]):
+        one = pycolmap.Reconstruction(model)
+        add_depth_points(one, folder, folder / "frames", METRES, without=held_out)
+        x[held_out] = placed(one)[:, 0].max()
+    # the two on the right show .4 units more of the wall
+    assert x[()] - x[NAMES[2:]] == pytest.approx(0.4, abs=2 * WALL / 50)
+
+
 def test_without_depth_nothing_is_added(scene):
     model, folder = scene
     assert add_depth_points(model, folder, folder / "frames", METRES) == 0

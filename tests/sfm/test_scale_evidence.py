@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 from synthetic import make_capture
 
-from recon_cli.io.depth_maps import write_depth, write_depth_list
+from recon_cli.io.depth_maps import read_depth, write_depth, write_depth_list
 from recon_cli.scene.camera import Lens
 from recon_cli.sfm.scale_evidence import scale_from_depth, scale_from_poses, up_from_poses
 
@@ -128,6 +128,11 @@ def test_depth_tells_the_scale_at_the_points_of_a_model(tmp_path):
     source = scale_from_depth(truth, tmp_path)
     assert source.scale == pytest.approx(2.5, rel=1e-3)
     assert source.error >= 0.005
+    rng = np.random.default_rng(0)
+    others = {name: write_depth(tmp_path, name, rng.uniform(0.5, 1.5, (192, 256)).astype(
+        np.float32) * read_depth(tmp_path, name, one)[0], lens) for name, one in maps.items()}
+    write_depth_list(tmp_path, others)
+    assert scale_from_depth(truth, tmp_path) is None  # of something else
     low = {name: write_depth(tmp_path, name, np.ones((192, 256), np.float32), lens,
                              confidence=np.zeros((192, 256), np.uint8)) for name in maps}
     write_depth_list(tmp_path, low)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sfm_inputs import every_nth, run, texture, write_inputs
 
 from recon_cli.errors import ConfigError, SfmError
-from recon_cli.io.colmap import read_images, read_scene
+from recon_cli.io.colmap import read_images, read_points, read_scene
 from recon_cli.io.images import read_png, write_png
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace.records import Frame, FrameList, Group, KnownPoses
@@ -137,6 +137,7 @@ def test_points_are_triangulated_from_poses_that_stay_where_they_are(room, truth
     for name, viewmat in poses.items():
         np.testing.assert_allclose(viewmat, truth[name], atol=1e-9)
     assert summary.points > 300
+    assert coloured(tmp_path / "out")
     assert summary.reprojection_error_px < 1
     camera, = summary.cameras
     assert camera == {"width": 600, "height": 340, "focal_px": 300.0, "frames": COUNT - 1}
@@ -152,7 +153,13 @@ def test_refined_poses_come_nearer_to_the_truth_and_keep_its_unit(room, truth, g
     np.testing.assert_allclose(steps(found(tmp_path / "out")), steps(truth), rtol=0.05)
     moved = summary.poses
     assert 0 < moved.moved_median < moved.moved_max < 0.1
+    assert coloured(tmp_path / "out")
     assert summary.reprojection_error_px < moved.reprojection_error_px_before
+
+
+def coloured(out):
+    """Whether the points have the colours of the images, and not black."""
+    return (read_points(out / "sparse" / "points3D.bin")[1].max(axis=1) > 10).mean() > 0.9
 
 
 def steps(viewmats):

@@ -12,14 +12,15 @@ from scenes import camera_at, random_splats
 from recon_cli.render import render
 from recon_cli.render.camera_gradient import camera_gradient
 from recon_cli.render.contract import StepOptions
+from recon_cli.render.depth_loss import depth_loss
 from recon_cli.scene.backdrop import Backdrop
-from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step, photometric_loss
+from recon_cli.scene.train_view import SensorDepth, TrainView
+from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 
 pytest.importorskip("triton", reason="triton is not installed")
 CAMERA = camera_at(24, 18)
-DEGREE, WEIGHT = 3, 0.2
+DEGREE, WEIGHT, DEPTH_WEIGHT = 3, 0.2, 0.005
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-6, 1e-4
 GAIN = np.array([0.8, 1.1, 1.3], np.float32)
 SEEN = random_splats(30, seed=3).map(torch.Tensor.float)
@@ -53,6 +54,11 @@ def exact(splats, view, gain=None):
     log_gain.requires_grad_()
     truth = torch.from_numpy(view.image).double() / 255
     loss = photometric_loss(out.rgb * log_gain.exp(), truth, WEIGHT, mask=counting)
+    if view.depth is not None:
+        known = torch.from_numpy(view.depth.image(view.camera, view.mask)).double()
+        noise = np.hypot(view.depth.noise, RENDERED_NOISE)
+        loss = loss + depth_loss(out.depth, out.alpha, known, noise,
+                                 DEPTH_WEIGHT / view.depth.cells)
     loss.backward()
     return loss.item(), leaves, log_gain.grad, out.statistics
 
@@ -79,6 +85,30 @@ def test_a_step_leaves_loss_gradients_and_statistics(mask, gain):
     assert np.linalg.norm(ours - turned) <= 1e-3 * np.linalg.norm(turned)
     if gain is not None:
         assert near(torch.from_numpy(compute.log_gain_gradient), true_gain)
+
+
+def depth():
+    """What a sensor measures at every second pixel, more than half of it other than it is."""
+    row, column = np.mgrid[0:18:2, 0:24:2].reshape(2, -1)
+    rays = np.stack([(column + 0.5 - CAMERA.cx) / CAMERA.fx,
+                     (row + 0.5 - CAMERA.cy) / CAMERA.fy], 1)
+    z = np.random.default_rng(2).uniform(1.5, 4, len(row))
+    return SensorDepth(rays.astype(np.float32), z.astype(np.float32), 0.02, len(row))
+
+
+def test_a_step_with_sensor_depth_and_those_before_and_after_without_it():
+    compute = gradient_step("triton", DEVICE)
+    views = [TrainView(CAMERA, photograph(), half(), depth=one) for one in (None, depth(), None)]
+    for view in views:
+        optimizer = SplatOptimizer(
+            SEEN.map(lambda tensor: tensor.clone().to(DEVICE)), CONFIG, 1.0, backend="triton")
+        loss, _ = compute(
+            optimizer, view, StepOptions(DEGREE, WEIGHT, depth_weight=DEPTH_WEIGHT))
+        true_loss, leaves, *_ = exact(SEEN, view)
+        assert loss == pytest.approx(true_loss, abs=LOSS_TOLERANCE)
+        for name, leaf in leaves.parameters().items():
+            assert near(optimizer.gradient(name), leaf.grad), name
+    assert exact(SEEN, views[1])[0] > exact(SEEN, views[0])[0] + 1e-4
 
 
 def test_a_step_on_a_backdrop_has_its_colour_and_one_after_it_is_on_black_again():

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.render.contract import Statistics, StepOptions, TargetImage
+from recon_cli.render.contract import Statistics, StepOptions, TargetDepth, TargetImage
+from recon_cli.render.depth_loss import depth_loss_gradient
 from recon_cli.kernels.kernel import kernel
 from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.kernels.simd_functions import fetch_add
@@ -47,7 +48,7 @@ class PhotometricStep:
         self, splats: Splats, gradients: Splats, camera: Camera, target: TargetImage,
         options: StepOptions,
     ) -> float:
-        """Returns the loss (1 - w) L1 + w (1 - SSIM) and overwrites `gradients`.
+        """Returns the loss (1 - w) L1 + w (1 - SSIM), and that of depth; overwrites `gradients`.
 
         Splats are float32 on the CPU, the photograph's pixels contiguous; sh_rest of `gradients` is
         left alone at degree 0 and without `options.harmonics`. A masked pixel counts as one without
@@ -64,7 +65,8 @@ class PhotometricStep:
         settings = RenderSettings(
             flat(splats.background).copy(), options.sh_degree, options.scores,
             counting=target.mask if options.scores or options.loo else None)
-        image = ImageBuffers(rgb, view.take("alpha", pixels), view.take("nothing", 0))
+        depth = view.take("nothing", 0) if target.depth is None else view.take("depth", pixels)
+        image = ImageBuffers(rgb, view.take("alpha", pixels), depth)
         view.forward(packed, camera, settings, image, self.statistics)
         if target.gain is not None:
             # whole rows: ten times faster
@@ -84,12 +86,31 @@ class PhotometricStep:
         if target.gain is not None:
             self._gain_backward(rgb.reshape(height, -1), grad_rgb.reshape(height, -1),
                                 np.tile(target.gain, width))
-        nothing = view.take("nothing", 0)
+        grad_alpha = grad_depth = view.take("nothing", 0)
+        if target.depth is not None:
+            grad_alpha, grad_depth = (
+                view.take(name, pixels) for name in ("grad_alpha", "grad_depth"))
+            loss += self._compare_depth(image, target.depth, grad_alpha, grad_depth)
         view.backward(
             packed, PackedSplats.from_tensors(gradients.parameters().values()),
-            ImageBuffers(grad_rgb, nothing, nothing), self.statistics, details=options.details,
-            loo=options.loo, harmonics=options.harmonics)
+            ImageBuffers(grad_rgb, grad_alpha, grad_depth), self.statistics,
+            details=options.details, loo=options.loo, harmonics=options.harmonics)
         return loss
+
+    def _compare_depth(
+        self, image: ImageBuffers, target: TargetDepth, grad_alpha: NDArray[np.float32],
+        grad_depth: NDArray[np.float32],
+    ) -> float:
+        """Returns the loss of the depth and writes its gradients [H * W]."""
+        truth = target.depths.reshape(-1)
+        known = np.flatnonzero(truth)
+        depth, alpha, sensor = (
+            torch.from_numpy(values[known]) for values in (image.depth, image.alpha, truth))
+        loss, by_depth, by_alpha = depth_loss_gradient(
+            depth, alpha, sensor, target.noise, target.factor)
+        grad_alpha[:], grad_depth[:] = 0, 0
+        grad_alpha[known], grad_depth[known] = by_alpha.numpy(), by_depth.numpy()
+        return float(loss)
 
     def _gain_backward(
         self, image: NDArray[np.float32], gradient: NDArray[np.float32],

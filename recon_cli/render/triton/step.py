@@ -17,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.render.contract import Statistics, StepOptions, TargetImage
+from recon_cli.render.contract import Statistics, StepOptions, TargetDepth, TargetImage
+from recon_cli.render.depth_loss import depth_loss_gradient
 from recon_cli.render.triton.cuda_graphs import Graphs
 from recon_cli.render.triton.gaussian import camera_buffer
 from recon_cli.render.triton.loss import loss_and_gradient
@@ -49,6 +50,7 @@ class _DeviceTarget:
     pixels: Tensor
     mask: Tensor | None
     gain: Tensor | None
+    depth: Tensor | None
 
 
 class PhotometricStep:
@@ -71,6 +73,7 @@ class PhotometricStep:
         self._background, self._shown = torch.zeros(3, device=device), (0.0, 0.0, 0.0)
         self._view = torch.zeros(25, dtype=torch.float64, device=device)
         self._pixels: dict[tuple[object, ...], Tensor] = {}
+        self._depth_factor = torch.zeros((), device=device)  # in the same memory, as above
         self._photographs: dict[int, tuple[NDArray[Any], Tensor]] = {}
         self._room_for_photographs = 0 if device.type == "cpu" else int(
             _PHOTOGRAPHS * torch.cuda.get_device_properties(device).total_memory)
@@ -105,13 +108,15 @@ class PhotometricStep:
             self._background.copy_(torch.tensor(color))
             self._shown = color
         photograph = self._upload(target)
+        noise = None if target.depth is None else target.depth.noise
         terms = TERMS[min(options.sh_degree, splats.sh_degree)]
         work = self._work(
-            ViewInput(splats, self._view, terms), gradients, camera, photograph, options)
+            ViewInput(splats, self._view, terms), gradients, camera, photograph, options,
+            noise)
         places = (tensor.data_ptr() for parameters in (splats, gradients)
                   for tensor in parameters.parameters().values())
         key = (*places, len(splats), splats.sh_rest.shape, camera.width, camera.height,
-               target.mask is None, options.sh_degree, options.ssim_weight, options.details,
+               target.mask is None, noise, options.sh_degree, options.ssim_weight, options.details,
                options.harmonics, self._room)
         if target.gain is None and not options.scores and not options.loo:
             self._graphs.run(key, work)
@@ -147,7 +152,16 @@ class PhotometricStep:
         return _DeviceTarget(
             self._copy_to_device("pixels", target.pixels),
             None if mask is None else self._copy_to_device("mask", mask),
-            None if target.gain is None else torch.from_numpy(target.gain).to(self._view.device))
+            None if target.gain is None else torch.from_numpy(target.gain).to(self._view.device),
+            None if target.depth is None else self._upload_depth(target.depth))
+
+    def _upload_depth(self, target: TargetDepth) -> Tensor:
+        """Returns the depths [H, W] in the same memory each time, and sets the factor."""
+        key = ("depth", *target.depths.shape)
+        if key not in self._pixels:
+            self._pixels[key] = torch.empty(target.depths.shape, device=self._view.device)
+        self._depth_factor.fill_(target.factor)
+        return self._pixels[key].copy_(torch.from_numpy(target.depths))
 
     def _copy_to_device(self, name: str, source: NDArray[Any]) -> Tensor:
         """Returns the device's own copy of a host array, in the same memory each time."""
@@ -174,12 +188,13 @@ class PhotometricStep:
 
     def _work(
         self, source: ViewInput, gradients: Splats, camera: Camera, target: _DeviceTarget,
-        options: StepOptions,
+        options: StepOptions, noise: float | None,
     ) -> Callable[[], None]:
         """Returns the work on views of this size; it reads the values that differ among them."""
         room, statistics = self._room, self.statistics
+        plain = noise is None
         backward = BackwardOptions(
-            plain=True, details=options.details, loo=options.loo, harmonics=options.harmonics)
+            plain=plain, details=options.details, loo=options.loo, harmonics=options.harmonics)
         scores = statistics if options.scores else None
 
         def work() -> None:
@@ -188,16 +203,22 @@ class PhotometricStep:
             lists = build_tile_lists(projected, starts, camera, self._view, room)
             image = composite_tiles(
                 lists, camera, self._background, target.mask, scores, keep=True,
-                plain=True)
+                plain=plain)
             rgb = image.rgb if target.gain is None else image.rgb * target.gain
             loss, grad_rgb = loss_and_gradient(rgb, target.pixels, options.ssim_weight, target.mask)
             if target.gain is not None:
                 # y = g x: dL/dlog g = g dL/dg = sum over pixels of y dL/dy
                 self.log_gain_gradient.copy_((rgb.double() * grad_rgb).sum((0, 1)))
                 grad_rgb = grad_rgb * target.gain
+            grad_depth = grad_alpha = None
+            if noise is not None and target.depth is not None:
+                off, grad_depth, grad_alpha = depth_loss_gradient(
+                    image.depth, image.alpha, target.depth, noise, self._depth_factor)
+                loss = loss + off
             record_step(projected.ends, room, loss, self._fits, self.status, self.counted)
             sums = composite_tiles_backward(
-                lists, image, self._background, target.mask, backward, grad_rgb)
+                lists, image, self._background, target.mask, backward, grad_rgb, grad_alpha,
+                grad_depth)
             project_splats_backward(
                 source, lists, sums, backward, gradients, statistics, counted=self.counted)
             torch.mul(projected.radii, self.counted, out=statistics.radii)
