@@ -65,13 +65,20 @@ class FlatView:
         return bool(left >= LEAST_COUNTING * np.count_nonzero(self.own))
 
 
-def find_views(camera: pycolmap.Camera) -> list[FlatView]:
-    """Returns the views into the images of a camera; they have its id."""
+def find_views(
+    camera: pycolmap.Camera,
+    counting: Callable[[], NDArray[np.bool_] | None] = lambda: None,
+) -> list[FlatView]:
+    """Returns the views into the images of a camera; they have its id.
+
+    `counting` returns the pixels [H, W] of its frames that some mask leaves, None for all: what
+    none leaves, as the border around a round picture, need not be shown.
+    """
     if is_panorama(camera):
         return _cube_views(camera)
     flat, warp = flatten(camera)
     if 1 - covered_share(warp, camera.width, camera.height) > MOST_LOST and (
-            faces := _wide_views(camera)):
+            faces := _wide_views(camera, counting())):
         return faces
     own = np.ones((flat.height, flat.width), np.bool_)
     return [FlatView(None, flat, np.eye(3), partial(resample, places=warp), own)]
@@ -121,9 +128,11 @@ def _cube_views(camera: pycolmap.Camera) -> list[FlatView]:
     return views
 
 
-def _wide_views(camera: pycolmap.Camera) -> list[FlatView]:
+def _wide_views(
+    camera: pycolmap.Camera, counting: NDArray[np.bool_] | None
+) -> list[FlatView]:
     """Returns the faces of a wide lens, the fewest that show all; none where no grid does."""
-    rays = _seen_rays(camera)
+    rays = _seen_rays(camera, counting)
     if not len(rays):
         return []
     x, y, z = rays.T
@@ -153,11 +162,16 @@ def _grids() -> Iterator[tuple[int, int]]:
                       key=lambda size: (size[0] * size[1], -size[0]))
 
 
-def _seen_rays(camera: pycolmap.Camera) -> NDArray[np.float64]:  # [K, 3]
-    """Returns rays of depth 1 and less through pixels of a frame, to its very edges."""
+def _seen_rays(
+    camera: pycolmap.Camera, counting: NDArray[np.bool_] | None
+) -> NDArray[np.float64]:  # [K, 3]
+    """Returns unit vectors through pixels of a frame that count, to its very edges."""
     shares = np.linspace(0, 1, _SAMPLES)
     across, down = np.meshgrid(shares * camera.width, shares * camera.height)
     pixels = np.stack([across.ravel(), down.ravel()], axis=1)
+    if counting is not None:
+        x, y = np.minimum(pixels.astype(int), [camera.width - 1, camera.height - 1]).T
+        pixels = pixels[counting[y, x]]
     rays = unit_rays(camera, pixels)
     ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > _LEAST_DEPTH)
     back = np.full_like(pixels, np.inf)

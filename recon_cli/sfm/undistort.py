@@ -11,9 +11,11 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial, reduce
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon_cli.errors import format_count
 from recon_cli.io.colmap import Pinhole
@@ -90,7 +92,9 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
     names = sorted(images)
     report.phase("undistorted", len(names))
     work = fresh_folder(job.out / "undistorted.partial")
-    views = {number: find_views(camera) for number, camera in model.cameras.items()}
+    views = {number: find_views(camera, partial(_counting, job, [
+        name for name in names if images[name].camera_id == number]))
+        for number, camera in model.cameras.items()}
     if any(each[0].face is not None for each in views.values()):
         _tell_faces(views, report)
         sizes = write_views(job, model, work, report, views, (IMAGES, TWINS, MASKS, SPARSE))
@@ -124,6 +128,14 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
         for index, camera in sorted(flat.cameras.items()))
     publish(work, job.out / "undistorted")
     return UndistortedResult(cameras=cameras)
+
+
+def _counting(job: MappingJob, names: Sequence[str]) -> NDArray[np.bool_] | None:  # [H, W]
+    """Returns the pixels that some mask of frames of one size leaves; None for all."""
+    if job.masks is None or not all((job.masks / name).exists() for name in names):
+        return None
+    masks = (read_png(job.masks / name)[:, :, 0] >= 128 for name in names)
+    return reduce(np.logical_or, masks)
 
 
 def _write_model(

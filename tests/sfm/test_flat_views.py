@@ -151,3 +151,30 @@ def test_a_frame_is_held_out_with_all_of_its_views_and_looks_ahead(wide):
         # the middle of the field of this lens is a degree beside its axis
         assert np.degrees(np.arccos(view.camera.viewmat[2, :3] @ pose[2, :3])) < 3
         np.testing.assert_allclose(view.camera.center, -pose[:, :3].T @ pose[:, 3], atol=1e-9)
+
+
+def test_the_border_of_a_round_picture_is_not_shown():
+    camera = camera_of(WIDE)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - 81, np.arange(HEIGHT) + 0.5 - 59)
+    counts = np.hypot(x, y) < 50
+    every, within = find_views(camera), find_views(camera, lambda: counts)
+    assert all(view.face is not None for view in within)
+    assert sum(view.own.size for view in within) < 0.7 * sum(view.own.size for view in every)
+    mask = counts * np.uint8(255)
+    for view in within:
+        assert view.shows(view.cut_mask(mask))
+
+
+def test_masks_tell_what_counts_in_any_frame_of_a_camera(tmp_path):
+    job, _ = make_capture(tmp_path, frames=3)
+    job = replace(job, masks=tmp_path / "masks")
+    job.masks.mkdir()
+    assert undistort._counting(job, job.names) is None
+    for place, name in enumerate(job.names):
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[:, place:place + 2] = 255
+        write_png(job.masks / name, mask)
+    counts = undistort._counting(job, job.names)
+    assert counts[:, :4].all()
+    assert not counts[:, 4:].any()
+    assert undistort._counting(replace(job, masks=None), job.names) is None
