@@ -26,7 +26,7 @@ SSIM_PADDED_CONVENTION = (
 MASK_CONVENTION = (
     "ignored pixels have no part in the squared error; the map of SSIM is averaged over the others")
 FACES_CONVENTION = (
-    "faces of panoramas or wide lenses, scored by frame, each direction once: the squared error and "
+    "faces of panoramas or wide lenses, scored by frame, each direction once: squared errors and "
     "the map of SSIM are averaged by solid angle")
 LPIPS_CONVENTION = "LPIPS 0.1 with AlexNet, of the float render, lower is better"
 CONVENTIONS: dict[str, Any] = {  # as JSON files hold them
