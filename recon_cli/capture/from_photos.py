@@ -22,6 +22,7 @@ from recon_cli.capture.frame_selection import FrameCandidate, Reason
 from recon_cli.capture.from_video import judge, report_reduced, report_short
 from recon_cli.capture.images import WHITE, Photo, describe_white, find_white, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
+from recon_cli.capture.lens_border import hide_border
 from recon_cli.capture.mask_files import mask_folders
 from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.panorama_masks import hide_carried
@@ -91,6 +92,9 @@ def ingest(
         report_reduced(width, height, longest, ctx)
     if source.panoramas:
         hide_carried(out, [str(candidate.name) for candidate in of_frame.values()], ctx)
+    elif config.overlays == "mask":
+        for group in groups:
+            hide_border(out, [str(of_frame[photo].name) for photo in group.photos], ctx)
     count = len(photos) + len(strangers) + len(folder.broken)
     frames = tuple(sorted((
         Frame(str(of_frame[photo].name), None, photo.name, taken.sharpness.get(photo.name),

@@ -15,6 +15,7 @@ from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.frame_measures import check_exposure, well_exposed
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
+from recon_cli.capture.lens_border import hide_border
 from recon_cli.capture.masks import write_mask
 from recon_cli.capture.panorama_masks import hide_carried
 from recon_cli.capture.panorama_motion import measure_parallax
@@ -169,11 +170,15 @@ def ingest(
             write_mask(out / store.MASKS / name, mask)
         middle = list(names.values())[len(names) // 2]
         draw_overlay(out / store.FOLDER / middle, mask, out / f"{prefix}{PICTURE}")
+    border = None
     if source.panoramas:
         hide_carried(out, list(names.values()), ctx)
+    elif config.overlays == "mask":
+        border = hide_border(out, list(names.values()), ctx)
+        tracks = tracks if border is None else tracks.outside(border)
     frames = tuple(
         Frame(name, scan.seconds[index], path.name, float(scan.sharpness[index]), held_out=False,
-              masked=scan.overlay is not None or source.panoramas)
+              masked=scan.overlay is not None or source.panoramas or border is not None)
         for index, name in names.items())
     # Tracks through panoramas are not used: their features match as far apart as they stand.
     return IngestedSource(

@@ -36,7 +36,7 @@ class IngestConfig(StageConfig):
         minimum=0.0, maximum=1.0)
     overlays: str = option(
         "mask", "Text, logos, dirt on the lens or a car's bonnet that stay in place in every frame "
-        "of a video: mask or keep them.", choices=("mask", "keep"))
+        "of a video, and the black border of a fisheye: mask or keep them.", choices=("mask", "keep"))
 
     camera: str = option(
         "auto", "Projection of the pictures: perspective, equirectangular (360-degree panoramas), "
@@ -100,7 +100,7 @@ class SfmConfig(StageConfig):
         choices=("auto", "exhaustive", "retrieval", "sequential"))
     camera_model: str = option(
         "auto", "Camera model of lenses that are not known, by COLMAP's name; auto: OPENCV, or "
-        "OPENCV_FISHEYE if the matches show a fisheye.",
+        "what the matches and their errors show, such as OPENCV_FISHEYE.",
         metavar="MODEL", late=True)
     max_features: int = option(
         3000, "Maximum SIFT keypoints per image; the coarsest are kept.", unit="keypoints",

@@ -26,8 +26,8 @@ SSIM_PADDED_CONVENTION = (
 MASK_CONVENTION = (
     "ignored pixels have no part in the squared error; the map of SSIM is averaged over the others")
 FACES_CONVENTION = (
-    "faces of panoramas together, each direction once: the squared error and the map of SSIM are "
-    "averaged over the sphere, by solid angle")
+    "faces of panoramas or wide lenses, scored by frame, each direction once: squared errors and "
+    "the map of SSIM are averaged by solid angle")
 LPIPS_CONVENTION = "LPIPS 0.1 with AlexNet, of the float render, lower is better"
 CONVENTIONS: dict[str, Any] = {  # as JSON files hold them
     "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,

@@ -1,4 +1,4 @@
-"""Panoramas put together from pictures of the faces of a cube."""
+"""Panoramas put together from pictures of faces: of a cube, or of a wide lens as a part of one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.faces import CUBE, face_order, nearest_face, panorama_rays
+from recon_cli.scene.faces import CUBE, face_order, middle_axes, nearest_face, panorama_rays
 
 
 def stitch_faces(
@@ -48,15 +48,17 @@ def _sample(
     return np.concatenate([np.zeros((0, picture.shape[2]), np.float32), *parts])
 
 
-def panorama_axes(name: str, camera: Camera) -> NDArray[np.float64] | None:  # [3, 3]
-    """Returns the rotation from the world to a panorama, by the view of one of its faces.
+def panorama_axes(
+    names: Sequence[str], cameras: Sequence[Camera]
+) -> NDArray[np.float64]:  # [3, 3]
+    """Returns the rotation from the world to a panorama, by views of its faces, at least one.
 
-    None where the name is not that of a face of a cube.
+    Faces of a wide lens lie around its middle.
     """
-    place = face_order(name)
+    place = face_order(names[0])
     if place == len(CUBE):
-        return None
-    return np.asarray(CUBE[place].rotation.T @ camera.viewmat[:3, :3])
+        return middle_axes([camera.viewmat[:3, :3] for camera in cameras])
+    return np.asarray(CUBE[place].rotation.T @ cameras[0].viewmat[:3, :3])
 
 
 def panorama_size(camera: Camera) -> tuple[int, int]:

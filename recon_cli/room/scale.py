@@ -146,7 +146,8 @@ def _locate(
     pinhole = pinholes.get(place.frame)
     if pinhole is None:
         raise ConfigError(
-            f"{place.frame} is a panorama, which has no single undistorted image to point into.",
+            f"{place.frame} is a panorama or of a wide lens: several undistorted images show it, "
+            "so that none can be pointed into.",
             hint="Name frames (their cameras) or points x,y,z instead of FRAME:u,v.")
     depth = _depth_at(place.frame, u, v, points @ viewmat[:3, :3].T + viewmat[:3, 3], pinhole)
     ray = np.array([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, 1.0])

@@ -2,6 +2,7 @@
 
 A panorama becomes the six faces of a cube around its camera. Each face sees a little more than a
 quarter turn, so that what is measured in a window of pixels is whole up to where the next begins.
+The picture of a wide lens becomes a grid of faces that lie around its axis.
 
 Axes are OpenCV's. A panorama is equirectangular as COLMAP has it: its middle looks along z, x is to
 the right, and the middle of the first pixel lies at 0.5, 0.5.
@@ -34,16 +35,49 @@ class Face:
 
 def _turn(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:
     """Returns [3, 3] from a picture's axes to a camera's turned right and then up by angles."""
+    return np.asarray(np.rint(_tilt(yaw_deg, pitch_deg)))  # quarter turns are exact
+
+
+def _tilt(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:
+    """Does as `_turn` for any angles."""
     yaw, pitch = np.radians([yaw_deg, pitch_deg])
     (s, c), (t, d) = (np.sin(yaw), np.cos(yaw)), (np.sin(pitch), np.cos(pitch))
     level = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
-    tilted = np.array([[1, 0, 0], [0, d, t], [0, -t, d]]) @ level
-    return np.asarray(np.rint(tilted))  # quarter turns are exact
+    return np.asarray(np.array([[1, 0, 0], [0, d, t], [0, -t, d]]) @ level)
 
 
 CUBE: tuple[Face, ...] = tuple(Face(name, _turn(yaw, pitch)) for name, yaw, pitch in (
     ("front", 0, 0), ("right", 90, 0), ("back", 180, 0), ("left", -90, 0),
     ("up", 0, 90), ("down", 0, -90)))
+
+
+def grid_faces(
+    across_deg: tuple[float, float], upward_deg: tuple[float, float],  # from and to, of all rays
+    columns: int, rows: int,
+) -> tuple[Face, ...]:
+    """Returns faces that share out the field of a wide lens evenly, by rows from the upper left."""
+    def middles(span: tuple[float, float], count: int) -> list[float]:
+        step = (span[1] - span[0]) / count
+        return [span[0] + (place + 0.5) * step for place in range(count)]
+
+    turns = [(yaw, pitch) for pitch in reversed(middles(upward_deg, rows))
+             for yaw in middles(across_deg, columns)]
+    return tuple(Face(f"view{number}", _tilt(yaw, pitch))
+                 for number, (yaw, pitch) in enumerate(turns, 1))
+
+
+def is_cube_face(view: str) -> bool:
+    """Returns whether the view of a name is a face of a cube."""
+    return face_order(view) < len(CUBE)
+
+
+def middle_axes(
+    rotations: Sequence[NDArray[np.float64]],  # [3, 3] each, from the world to a face
+) -> NDArray[np.float64]:  # [3, 3]
+    """Returns the rotation in the middle of those of the faces of a wide lens."""
+    left, _, right = np.linalg.svd(np.sum(rotations, axis=0))
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    return np.asarray(left @ turn @ right)
 
 
 def view_name(frame: str, face: Face) -> str:

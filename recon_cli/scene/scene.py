@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.cells import Cell
-from recon_cli.scene.faces import face_order
+from recon_cli.scene.faces import face_order, is_cube_face, middle_axes
 
 _REACH = 20.0  # extents; a room reaches some
 _LEAST_EXTENT = 0.05  # of the median distance of the points; a step aside in a room
@@ -85,14 +85,27 @@ class Scene:
 def views_ahead(views: Sequence[View]) -> tuple[View, ...]:
     """Returns the views that show the way of the camera: of several faces the one that looks ahead.
 
-    That is the first in the order of `scene.faces` of those that are there.
+    That is the first in the order of `scene.faces` of those that are there. Faces of a wide lens
+    lie around its axis: the first of them is turned to it.
     """
     by_frame: dict[str, list[View]] = {}
     for view in views:
         by_frame.setdefault(view.frame, []).append(view)
-    ahead = {min(each, key=lambda view: face_order(view.name)).name if len(each) > 1
-             else each[0].name for each in by_frame.values()}
-    return tuple(view for view in views if view.name in ahead)
+    ahead = {}
+    for each in by_frame.values():
+        first = min(each, key=lambda view: face_order(view.name)) if len(each) > 1 else each[0]
+        aside = len(each) > 1 and not is_cube_face(first.name)
+        ahead[first.name] = _turn_ahead(first, each) if aside else first
+    return tuple(ahead[view.name] for view in views if view.name in ahead)
+
+
+def _turn_ahead(first: View, views: Sequence[View]) -> View:
+    """Returns a face of a wide lens, turned to the middle of all of them."""
+    camera, viewmat = first.camera, np.eye(4)
+    viewmat[:3, :3] = middle_axes([view.camera.viewmat[:3, :3] for view in views])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ camera.center
+    return replace(first, camera=replace(
+        camera, cx=camera.width / 2, cy=camera.height / 2, viewmat=viewmat))
 
 
 def split_views(

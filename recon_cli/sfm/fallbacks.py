@@ -77,6 +77,8 @@ class MapperAttempt(JsonRecord):
     trusted: bool = False
     weak_link: float | None = None
     reprojection_error_px: float | None = None
+    # Models that fit its cameras clearly better, by number; only where another attempt may use them
+    lenses: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def models(self) -> list[int]:
@@ -147,9 +149,10 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
     log = StepLog(job.attempts)
     attempts: list[MapperAttempt] = []
     verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
-    ways = _begin_with_fisheye(job, list_fallbacks(job), report)
+    ways = list(_begin_with_fisheye(job, list_fallbacks(job), report))
     reason = ways[0].reason
-    for fallback in ways:
+    while ways:
+        fallback = ways.pop(0)
         attempt = log.result(fallback.name, MapperAttempt)
         if attempt is None:
             attempt, candidate = _try_fallback(job, fallback, reason, attempts, report, deadline)
@@ -161,7 +164,9 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
             reason = attempt.shortfall
             if not reason:
                 break
-            if fallback is not ways[-1] and attempt.seconds > 60 * MINUTES_TOLD:
+            if attempt.lenses:
+                ways.insert(0, _with_lenses(attempt.lenses))
+            if ways and attempt.seconds > 60 * MINUTES_TOLD:
                 report.tell(f"trying another mapper, for about "
                             f"{format_minutes(FURTHER * attempt.seconds)} more: {reason}")
     return _publish_best(job, attempts, verdicts)
@@ -190,6 +195,21 @@ def _begin_with_fisheye(
     return (fisheye, dataclasses.replace(ways[0], choose_pairs=lambda *_: set()), *ways[1:])
 
 
+def _with_lenses(models: Mapping[str, str]) -> Fallback:
+    """Returns the way to a model with other camera models, by the numbers of the cameras."""
+    return Fallback(wide_lens.OTHER, "", lambda *_: set(), lambda job, report: (
+        wide_lens.map_lenses(job, report, {int(number): models[number] for number in models})))
+
+
+def may_change_lenses(job: MappingJob, before: Collection[str]) -> bool:
+    """Returns whether an attempt with other camera models may follow those of some names.
+
+    Not where the user names one, and not of segments, which are joined by their intrinsics.
+    """
+    named = any(group.model != "auto" for group in job.groups)
+    return not named and not job.segments and wide_lens.OTHER not in before
+
+
 def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
     """Returns the frames with features that a model could hold.
 
@@ -204,17 +224,24 @@ def reachable(job: MappingJob, candidate: ModelCandidate) -> set[str]:
     return textured.intersection(connected)
 
 
-def shortfall(candidate: ModelCandidate, reach: Collection[str]) -> str:
-    """Returns why a model is not good enough, given the frames that it could hold; empty if not."""
+def shortfall(
+    candidate: ModelCandidate, reach: Collection[str], *, lenses: bool = False
+) -> str:
+    """Returns why a model is not good enough, given the frames that it could hold; empty if not.
+
+    `lenses` says whether another camera model may be tried: no other mapper mends a wrong one.
+    """
     held = candidate.model.num_reg_images()
     if held < ENOUGH_FRAMES * len(reach):
         return f"only {held} of the {len(reach)} frames that can be registered were"
     apart = [names for names in candidate.apart if set(names).intersection(reach)]
     if apart:
         return f"the capture split into {1 + len(apart)} disconnected models"
-    if not candidate.verdict.trusted:
-        return " ".join(candidate.verdict.problems)
-    return ""
+    found = candidate.verdict.lenses
+    told = {lens.sentence() for lens in found}
+    problems = [text for text in candidate.verdict.problems if text not in told]
+    return " ".join(problems) or ("; ".join(
+        lens.describe() for lens in found) if lenses else "")
 
 
 def describe_other_rooms(job: MappingJob, candidate: ModelCandidate) -> str:
@@ -272,12 +299,16 @@ def _try_fallback(
             "model": candidate.model,
             **{f"{OTHERS}/{k}": other for k, other in enumerate(candidate.others)}}.items():
         write_model(model, fresh_folder(folder / name))
+    found = candidate.verdict.lenses if may_change_lenses(
+        job, [fallback.name, *(attempt.name for attempt in before)]) else ()
     attempt = MapperAttempt(
         fallback.name, reason, seconds, "", tuple(mapper.list_registered(candidate.model)),
-        shortfall(candidate, reachable(job, candidate)) or describe_other_rooms(job, candidate),
+        shortfall(candidate, reachable(job, candidate), lenses=bool(found))
+        or describe_other_rooms(job, candidate),
         candidate.apart, candidate.rejected,
         candidate.verdict.trusted, candidate.verdict.weakest_cut.share,
-        candidate.model.compute_mean_reprojection_error())
+        candidate.model.compute_mean_reprojection_error(),
+        {str(lens.camera): lens.better for lens in found})
     return attempt, candidate
 
 
@@ -302,7 +333,8 @@ def _publish_best(
     folder = job.attempts / chosen.name
     model = pycolmap.Reconstruction(folder / "model")
     verdict = verdicts.get(chosen.name) or examine(
-        model, job.database, job.names, sharpness=job.sharpness, times=job.times)
+        model, job.database, job.names, sharpness=job.sharpness, times=job.times,
+        lenses=job.unknown_lenses)
     delivered = deliver_parts(
         job, ModelCandidate(model, verdict, chosen.apart, chosen.rejected),
         [pycolmap.Reconstruction(folder / OTHERS / str(k)) for k in range(len(chosen.apart))])
@@ -324,7 +356,8 @@ def _publish_best(
 def _with_own_matches(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
     own = job.attempts / name / skeleton.MATCHES_DB
-    has_own = name in (TRACKS, wide_lens.ATTEMPT) or (name == SEGMENTS and job.tracks is not None)
+    has_own = name in (TRACKS, wide_lens.ATTEMPT, wide_lens.OTHER) or (
+        name == SEGMENTS and job.tracks is not None)
     return dataclasses.replace(job, matches_db=own) if has_own else job
 
 

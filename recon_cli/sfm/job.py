@@ -98,6 +98,15 @@ class MappingJob(JsonRecord):
                          for name in group.names)
 
     @property
+    def unknown_lenses(self) -> tuple[int, ...]:
+        """The cameras, by number in the database, whose intrinsics are estimated alone here.
+
+        None in a segment: segments are joined by the intrinsics that all have.
+        """
+        return () if self.last == "model" else tuple(
+            number for number, group in enumerate(self.groups, 1) if group.lens is None)
+
+    @property
     def database(self) -> Path:
         """COLMAP's database of features and matches."""
         return self.matches_db or self.out / DATABASE

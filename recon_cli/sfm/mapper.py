@@ -168,6 +168,20 @@ def adjust(
     model.update_point_3d_errors()
 
 
+def adjust_points(model: pycolmap.Reconstruction) -> None:
+    """Adjusts the points of a model in place, by its cameras as they are."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = THREADS
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+        config.set_constant_rig_from_world_pose(model.image(number).frame_id)
+    for camera in model.cameras:
+        config.set_constant_cam_intrinsics(camera)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
 def refine(
     job: MappingJob, model: pycolmap.Reconstruction, rounds: int | None = None
 ) -> None:

@@ -80,7 +80,8 @@ def drop_outliers(job: MappingJob, model: pycolmap.Reconstruction) -> ModelCandi
 
 
 def _examine(job: MappingJob, model: pycolmap.Reconstruction) -> ModelVerdict:
-    return verdict.examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times)
+    return verdict.examine(model, job.database, job.names, sharpness=job.sharpness,
+                           times=job.times, lenses=job.unknown_lenses)
 
 
 def _list_apart(

@@ -10,32 +10,40 @@ import dataclasses
 import filecmp
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial, reduce
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.errors import format_count
 from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.io.training_scene import held_out_names
 from recon_cli.room.scale import ScaleBetween
+from recon_cli.scene.faces import is_cube_face, view_name
 from recon_cli.sfm.align_world import refuse_contradiction, world_transform
 from recon_cli.sfm.depth_points import add_depth_points
+from recon_cli.sfm.flat_views import (
+    MOST_LOST,
+    FlatView,
+    find_views,
+    has_faces,
+    places_in,
+    resample,
+)
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
 from recon_cli.sfm.results import PlacedResult, UndistortedResult
 from recon_cli.sfm.scale_evidence import ask_device
 from recon_cli.sfm.shared_points import to_sim3d
-from recon_cli.sfm.sphere import is_panorama
 from recon_cli.sfm.undistort_faces import write_views
 from recon_cli.workspace import atomic
 from recon_cli.workspace.summaries import WorldSummary
 
-MOST_LOST = 0.1  # of a frame by undistortion, above which it is told
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 
 
@@ -57,13 +65,14 @@ def place_model(job: MappingJob) -> PlacedResult:
         ingest = job.poses.parent
         add_depth_points(model, ingest, job.frames, device.depth_scale,
                          without=held_out_names(ingest))
+    several = {number for number, camera in model.cameras.items() if has_faces(camera)}
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,
         gravity=job.gravity and device.axes_open, given_up=device.up,
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
         metric=device.metric, sources=device.sources,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()
-                  if not is_panorama(image.camera)})
+                  if image.camera_id not in several})
     refuse_contradiction(world.evidence, accepted=job.accept_weak)
     if device.remark:
         world = dataclasses.replace(world, sentences=(*world.sentences, device.remark))
@@ -91,27 +100,30 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
     names = sorted(images)
     report.phase("undistorted", len(names))
     work = fresh_folder(job.out / "undistorted.partial")
-    if any(map(is_panorama, model.cameras.values())):
-        sizes = write_views(job, model, work, report, _flatten, (IMAGES, TWINS, MASKS, SPARSE))
+    views = {number: find_views(camera, partial(_counting, job, [
+        name for name in names if images[name].camera_id == number]))
+        for number, camera in model.cameras.items()}
+    if any(each[0].face is not None for each in views.values()):
+        _tell_faces(views, report)
+        sizes = write_views(job, model, work, report, views, (IMAGES, TWINS, MASKS, SPARSE))
         publish(work, job.out / "undistorted")
         return UndistortedResult(cameras=tuple(sizes))
     flat = _write_model(job, model, names[0], work)
-    warps = {number: _warp(camera, flat.cameras[number])
+    warps = {number: places_in(camera, flat.cameras[number])
              for number, camera in model.cameras.items()}
-    _tell_lost(model, warps, report)
     masked = {name for name in names if job.masks and (job.masks / name).exists()}
     for folder in (IMAGES, TWINS, *([MASKS] if masked else [])):
         (work / folder).mkdir()
 
     def write(name: str) -> None:
         warp, target = warps[images[name].camera_id], work / IMAGES / name
-        write_png(target, _remap(read_png(job.frames / name), warp))
+        write_png(target, resample(read_png(job.frames / name), warp))
         if filecmp.cmp(job.frames / name, job.denoised / name, shallow=False):
             shutil.copyfile(target, work / TWINS / name)
         else:
-            write_png(work / TWINS / name, _remap(read_png(job.denoised / name), warp))
+            write_png(work / TWINS / name, resample(read_png(job.denoised / name), warp))
         if job.masks is not None and name in masked:  # 255 where most of a pixel counts
-            gray = _remap(read_png(job.masks / name)[:, :, 0], warp)
+            gray = resample(read_png(job.masks / name)[:, :, 0], warp)
             write_png(work / MASKS / name, np.where(gray < 128, 0, 255).astype(np.uint8))
 
     with ThreadPoolExecutor(job.threads) as pool:
@@ -124,6 +136,14 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
         for index, camera in sorted(flat.cameras.items()))
     publish(work, job.out / "undistorted")
     return UndistortedResult(cameras=cameras)
+
+
+def _counting(job: MappingJob, names: Sequence[str]) -> NDArray[np.bool_] | None:  # [H, W]
+    """Returns the pixels that some mask of frames of one size leaves; None for all."""
+    if job.masks is None or not all((job.masks / name).exists() for name in names):
+        return None
+    masks = (read_png(job.masks / name)[:, :, 0] >= 128 for name in names)
+    return reduce(np.logical_or, masks)
 
 
 def _write_model(
@@ -141,47 +161,13 @@ def _write_model(
     return pycolmap.Reconstruction(work / SPARSE)
 
 
-def _flatten(
-    camera: pycolmap.Camera
-) -> tuple[pycolmap.Camera, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]]:
-    """Returns the camera of the undistorted image, and what makes that of a frame."""
-    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    flat.camera_id = camera.camera_id
-    warp = _warp(camera, flat)
-    return flat, lambda image: _remap(image, warp)
-
-
-def _warp(camera: pycolmap.Camera, flat: pycolmap.Camera) -> NDArray[np.float32]:  # [H, W, 2]
-    """Returns where each pixel of the undistorted image lies in the frame (OpenCV: 0, 0 is the
-    middle of the first pixel)."""
-    x, y = np.meshgrid(np.arange(flat.width) + 0.5, np.arange(flat.height) + 0.5)
-    rays = np.asarray(flat.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1)))
-    places = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
-    return (places - 0.5).reshape(flat.height, flat.width, 2).astype(np.float32)
-
-
-def _tell_lost(
-    model: pycolmap.Reconstruction, warps: Mapping[int, NDArray[np.float32]], report: Reporter
-) -> None:
-    """Gives notice of lenses of which one pinhole picture shows much less than the frame."""
-    for number, warp in sorted(warps.items()):
-        camera = model.camera(number)
-        lost = 1 - covered_share(warp, camera.width, camera.height)
-        if lost > MOST_LOST:
-            which = "" if len(warps) == 1 else f" of camera {number}"
+def _tell_faces(views: Mapping[int, Sequence[FlatView]], report: Reporter) -> None:
+    """Gives notice of lenses whose frames are seen through faces."""
+    for number, each in sorted(views.items()):
+        face = each[0].face
+        if face is not None and not is_cube_face(view_name("x.png", face)):
+            which = "" if len(views) == 1 else f" of camera {number}"
             report.tell(
-                f"The lens{which} is so wide that undistorted pictures leave out {lost:.0%} of "
-                "each frame, at its edges: what only the edges show is not trained. Cameras are "
-                "found with the whole frames.")
-
-
-def covered_share(warp: NDArray[np.float32], width: int, height: int) -> float:
-    """Returns the share of a frame that an undistorted image shows, by its `_warp` [H, W, 2]."""
-    border = np.concatenate([warp[0], warp[:, -1], warp[-1, ::-1], warp[::-1, 0]])
-    # through the middles of the outer pixels, half a pixel inside
-    return float(cv2.contourArea(border)) / ((width - 1) * (height - 1))
-
-
-def _remap(image: NDArray[np.uint8], warp: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.asarray(cv2.remap(
-        image, warp, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+                f"The lens{which} is so wide that an undistorted picture would leave out more than "
+                f"{MOST_LOST:.0%} of each frame: {format_count(len(each), 'pinhole view')} of each "
+                "frame, which show all of it, are used instead.")

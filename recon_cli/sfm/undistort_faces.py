@@ -1,7 +1,7 @@
-"""The views of a model with panoramas: each panorama as the pinhole images of its faces.
+"""The views of a model with panoramas or wide lenses: their frames as pinhole images of faces.
 
-Every view has a camera and an image of its own, so that any trainer reads them; faces.json says
-which views are faces of which frame. A point that a panorama sees is seen by the face that is
+Every view has an image of its own and a pinhole camera, so that any trainer reads them; faces.json
+says which views are faces of which frame. A point that a frame sees is seen by the face that is
 nearest to it.
 """
 
@@ -10,10 +10,8 @@ from __future__ import annotations
 import filecmp
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,51 +20,20 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.face_frames import write_face_frames
 from recon_cli.io.images import read_png, write_png
-from recon_cli.scene.faces import Face, nearest_face, view_name
-from recon_cli.sfm.face_images import cube_warps, cut_face
+from recon_cli.scene.faces import nearest_face, view_name
+from recon_cli.sfm.flat_views import FlatView
 from recon_cli.sfm.job import MappingJob, Reporter
-from recon_cli.sfm.sphere import is_panorama, unit_rays
-
-# Of the pixels of a face that belong to it: where masks leave fewer, as of the floor below a
-# tripod, there is no view.
-LEAST_COUNTING = 0.05
-
-Cut = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
-
-
-@dataclass(frozen=True, eq=False)
-class FlatView:
-    """A pinhole view into the images of a camera."""
-
-    face: Face | None  # one of several
-    camera: pycolmap.Camera
-    rotation: NDArray[np.float64]  # [3, 3] from the axes of the camera
-    cut: Cut  # its picture from that of the frame
-    own: NDArray[np.bool_]  # [H, W], the pixels that no other view of the frame is nearer to
-
-    def name_for(self, frame: str) -> str:
-        """Returns the name of the view of a frame."""
-        return frame if self.face is None else view_name(frame, self.face)
-
-    def shows(self, mask: NDArray[np.uint8] | None) -> bool:  # [H, W]
-        """Returns whether a mask leaves enough for a view."""
-        if mask is None or self.face is None:
-            return True
-        left = np.count_nonzero(mask[self.own])
-        return bool(left >= LEAST_COUNTING * np.count_nonzero(self.own))
+from recon_cli.sfm.sphere import unit_rays
 
 
 def write_views(
     job: MappingJob, model: pycolmap.Reconstruction, work: Path, report: Reporter,
-    flatten: Callable[[pycolmap.Camera], tuple[pycolmap.Camera, Cut]],
+    views: Mapping[int, Sequence[FlatView]],  # by camera
     folders: Sequence[str],  # of images, their denoised twins, masks and the model
 ) -> list[dict[str, float]]:
-    """Writes the views of a model into `work` and returns their cameras, as `UndistortedResult`.
-
-    `flatten` gives the pinhole camera and the picture of an ordinary image.
-    """
+    """Writes the views of a model into `work` and returns their cameras, as `UndistortedResult`."""
     images, twins, masks, sparse = folders
-    views = {number: _views(camera, flatten) for number, camera in model.cameras.items()}
+    number_cameras(views)
     frames = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     for folder in (images, twins, sparse):
         (work / folder).mkdir()
@@ -77,8 +44,7 @@ def write_views(
         mask = None
         if job.masks is not None and (job.masks / name).exists():
             mask = read_png(job.masks / name)[:, :, 0]
-        hidden = [None if mask is None else np.where(
-            view.cut(mask) < 128, 0, 255).astype(np.uint8) for view in flat]
+        hidden = [view.cut_mask(mask) for view in flat]
         shown = [view.shows(gray) for gray, view in zip(hidden, flat, strict=True)]
         original = read_png(job.frames / name)
         same = filecmp.cmp(job.frames / name, job.denoised / name, shallow=False)
@@ -86,7 +52,7 @@ def write_views(
         for view, gray, there in zip(flat, hidden, shown, strict=True):
             if not there:
                 continue
-            file = view.name_for(name)
+            file = name_view(name, view)
             write_png(work / images / file, view.cut(original))
             if same:
                 shutil.copyfile(work / images / file, work / twins / file)
@@ -106,7 +72,7 @@ def write_views(
     flat = _build_model(model, views, frames, shown)
     write_model(flat, work / sparse)
     write_face_frames(work, {
-        view.name_for(name): name for name in names for view in views[frames[name].camera_id]
+        name_view(name, view): name for name in names for view in views[frames[name].camera_id]
         if view.face is not None})
     counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
     return [{"width": camera.width, "height": camera.height,
@@ -114,32 +80,36 @@ def write_views(
             for number, camera in sorted(flat.cameras.items())]
 
 
-def _views(
-    camera: pycolmap.Camera, flatten: Callable[[pycolmap.Camera], tuple[pycolmap.Camera, Cut]]
-) -> list[FlatView]:
-    """Returns the views into the images of a camera."""
-    if not is_panorama(camera):
-        flat, cut = flatten(camera)
-        own = np.ones((flat.height, flat.width), np.bool_)
-        return [FlatView(None, flat, np.eye(3), cut, own)]
-    views = []
-    for face, warp in cube_warps(camera.width, camera.height):
-        flat = pycolmap.Camera(
-            camera_id=camera.camera_id, model="PINHOLE", width=warp.side, height=warp.side,
-            params=(warp.focal, warp.focal, warp.side / 2, warp.side / 2))
-        views.append(FlatView(
-            face, flat, face.rotation, partial(cut_face, warp=warp), warp.own.astype(np.bool_)))
-    return views
+def name_view(frame: str, view: FlatView) -> str:
+    """Returns the name of the view of a frame."""
+    return frame if view.face is None else view_name(frame, view.face)
+
+
+def number_cameras(views: Mapping[int, Sequence[FlatView]]) -> None:
+    """Gives views of another size or lens than the first of their camera ids of their own."""
+    free = max(views) + 1
+    for each in views.values():
+        ids: dict[tuple[int | float, ...], int] = {}
+        for view in each:
+            camera = view.camera
+            lens = (camera.width, camera.height, *camera.params)
+            if lens not in ids:
+                ids[lens] = free if ids else camera.camera_id
+                free += len(ids) > 1
+            camera.camera_id = ids[lens]
 
 
 def _build_model(
     model: pycolmap.Reconstruction, views: Mapping[int, Sequence[FlatView]],
     frames: Mapping[str, pycolmap.Image], shown: Mapping[str, Sequence[bool]],
 ) -> pycolmap.Reconstruction:
-    """Returns the model of the views, with the points that they see; ids of cameras stay."""
+    """Returns the model of the views, with the points that they see."""
     flat = pycolmap.Reconstruction()
-    for number in sorted({image.camera_id for image in frames.values()}):
-        flat.add_camera_with_trivial_rig(views[number][0].camera)
+    cameras = {view.camera.camera_id: view.camera
+               for number in {image.camera_id for image in frames.values()}
+               for view in views[number]}
+    for _, camera in sorted(cameras.items()):
+        flat.add_camera_with_trivial_rig(camera)
     seen: dict[int, list[tuple[int, int]]] = {}  # (image, place) of the observations of each point
     number = 0
     for name in sorted(frames):
@@ -153,7 +123,7 @@ def _build_model(
             number += 1
             flat.add_image_with_trivial_frame(
                 pycolmap.Image(
-                    image_id=number, name=view.name_for(name), camera_id=image.camera_id,
+                    image_id=number, name=name_view(name, view), camera_id=view.camera.camera_id,
                     points2D=pycolmap.Point2DList([pycolmap.Point2D(spot) for spot in spots])),
                 pycolmap.Rigid3d(view.rotation @ pose))
             for place, point in enumerate(points):

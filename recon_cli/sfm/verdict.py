@@ -2,14 +2,14 @@
 
 The share of registered images and the reprojection error do not see the worst failures: two good
 halves placed wrongly to each other (`weakest_cut`), two places laid over each other
-(`visual_aliasing`), a walk whose scale changes on its way (`scale_drift`, `open_loops`), and a text
-over bare walls (`still_points`).
+(`visual_aliasing`), a walk whose scale changes on its way (`scale_drift`, `open_loops`), a text
+over bare walls (`still_points`), and a lens that is not what its camera model says (`lens_trial`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path, PurePath
@@ -22,6 +22,7 @@ from recon_cli.errors import SfmError, format_count, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
+from recon_cli.sfm.lens_trial import BetterLens, find_better_lenses
 from recon_cli.sfm.limits import FEW_KEYPOINTS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
 from recon_cli.sfm.open_loops import OpenLoop, find_open_loops
 from recon_cli.sfm.scale_drift import (
@@ -108,6 +109,7 @@ class ModelVerdict(JsonRecord):
     scale: ScaleCut | None
     open_loops: tuple[OpenLoop, ...]  # the one that most points show first
     problems: tuple[str, ...]  # why the model cannot be trusted, a sentence each
+    lenses: tuple[BetterLens, ...] = ()  # cameras that another camera model fits better
 
     @property
     def trusted(self) -> bool:
@@ -158,6 +160,7 @@ def examine(
     sharpness: Mapping[str, float | None] | None = None,  # variance of the Laplacian, where known
     times: Mapping[str, float | None] | None = None,  # seconds in the video, where known
     given: bool = False,  # the poses are, so that nothing drifts
+    lenses: Collection[int] = (),  # the cameras whose lens is not known
 ) -> ModelVerdict:
     """Returns the verdict on a finished model, or raises ValueError if its names do not match."""
     evidence = gather_evidence(model, database, names)
@@ -172,6 +175,7 @@ def examine(
     match_parts = _parts(names, view_graph.weights(len(names), evidence.pairs, evidence.matches))
     jumps = find_jumps(evidence, times or {})
     still = find_still_share(model)
+    better = find_better_lenses(model, lenses)
     return ModelVerdict(
         images=len(names), registered=int(np.count_nonzero(rows)),
         model_parts=model_parts, match_parts=match_parts,
@@ -181,10 +185,11 @@ def examine(
         points=Histogram.from_values(evidence.points[rows]),
         neighbours=Histogram.from_values(
             np.count_nonzero(evidence.shared[rows] >= MIN_POSE_INLIERS, axis=1)),
-        still=still, scale=scale, open_loops=loops,
+        still=still, scale=scale, open_loops=loops, lenses=better,
         problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
                   *_describe_drift(loops, scale), *_describe_still(still),
-                  *describe_shifted_centres(model, database)))
+                  *describe_shifted_centres(model, database),
+                  *(lens.sentence() for lens in better if lens.is_wrong)))
 
 
 def _find_drift(
@@ -239,6 +244,11 @@ def check_weak_link(verdict: ModelVerdict, accept: bool, *, given: bool = False)
     problems = refuted if given else verdict.problems
     if accept or not problems:
         return
+    wrong = [lens for lens in verdict.lenses if lens.is_wrong]
+    if len(problems) == len(wrong):  # nothing else speaks against it
+        raise SfmError(" ".join(problems), hint=(
+            f"Use --camera-model {wrong[0].better}, or keep the model as it is with "
+            "--accept-weak."))
     raise SfmError(
         " ".join(problems),
         hint="Use more frames between the two parts (`recon ingest --frames N`), match all of them "

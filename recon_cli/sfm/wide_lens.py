@@ -9,6 +9,8 @@ motion explains, for fisheyes and for ordinary lenses without distortion of seve
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,8 @@ from recon_cli.sfm import database, mapper, matching
 from recon_cli.sfm.job import DATABASE, CameraGroup, MappingJob, Reporter
 from recon_cli.sfm.limits import MIN_PAIR_INLIERS
 
-ATTEMPT = "fisheye"  # the fallback, which has a database of its own
+# The fallbacks, which have databases of their own: for fisheyes, and for what errors of points show
+ATTEMPT, OTHER = "fisheye", "lens"
 FISHEYE, ORDINARY = "OPENCV_FISHEYE", "SIMPLE_PINHOLE"
 # Focal lengths that are tried, in longer sides of the image; mapping corrects the rest. Of a
 # fisheye: from 180 degrees across the shorter side to about 75 across the longer one.
@@ -82,12 +85,34 @@ def map_fisheye(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstructi
     with pycolmap.Database.open(job.database) as opened:
         for number, focal in fisheyes.items():
             opened.update_camera(_camera(job.groups[number - 1], FISHEYE, focal, number))
+        for number in set(job.unknown_lenses) - fisheyes.keys():
+            _rename(opened, number, job.groups[number - 1].model)
         opened.clear_two_view_geometries()
     matching.verify_pairs(job, pairs)
     models = mapper.map_incrementally(job, report)
     if max((model.num_reg_images() for model in models), default=0) < len(job.names) / 2:
         models += mapper.map_globally(job, report)
     return models
+
+
+def map_lenses(
+    job: MappingJob, report: Reporter, models: Mapping[int, str]
+) -> list[pycolmap.Reconstruction]:
+    """Returns the models of a capture with other camera models, by the numbers of the cameras."""
+    groups = tuple(replace(group, model=models.get(number, group.model))
+                   for number, group in enumerate(job.groups, 1))
+    return map_fisheye(replace(job, groups=groups), report)
+
+
+def _rename(opened: pycolmap.Database, number: int, model: str) -> None:
+    """Gives a camera in a database another model, without distortion, if one is named."""
+    known = opened.read_camera(number)
+    if model in ("auto", known.model_name):
+        return
+    camera = pycolmap.Camera.create_from_model_name(
+        number, model, known.mean_focal_length(), known.width, known.height)
+    camera.has_prior_focal_length = known.has_prior_focal_length
+    opened.update_camera(camera)
 
 
 def _camera(

@@ -6,7 +6,7 @@ import pytest
 from recon_cli.evaluation.metrics import psnr, ssim
 from recon_cli.evaluation.panoramas import PanoramaPictures, face_weights, join_faces, score_face
 from recon_cli.io.views import ReferenceView
-from recon_cli.scene.faces import CUBE, face_camera, face_size, view_name
+from recon_cli.scene.faces import CUBE, face_camera, face_size, grid_faces, view_name
 
 WIDTH = 256
 SIZE = face_size(WIDTH / (2 * np.pi))
@@ -105,6 +105,38 @@ def test_pictures_are_joined_once_all_faces_are_there():
     np.testing.assert_allclose(render * 255, photo, atol=0.51)
     assert mask is not None
     assert mask.all()
+
+
+def wide_views(value, *, masks=None):
+    """The faces of a frame of a wide lens, 160 by 80 degrees, in one colour."""
+    faces = grid_faces((-80, 80), (-40, 40), 2, 1)
+    return [ReferenceView(
+        face_camera(face, *SIZE, np.eye(4)), gray(value), None if masks is None else masks[place],
+        name=view_name("w.png", face), face_of="w.png") for place, face in enumerate(faces)]
+
+
+def test_a_frame_of_a_wide_lens_is_scored_whole_by_what_its_faces_show():
+    result = score(wide_views(100), lambda _: gray(110) / 255)
+    assert result.name == "w.png"
+    assert result.psnr_db == pytest.approx(20 * np.log10(255 / 10), abs=1e-4)
+    assert result.pixels_scored == 1
+    half = [np.ones((SIZE[0], SIZE[0]), np.bool_), np.zeros((SIZE[0], SIZE[0]), np.bool_)]
+    assert score(wide_views(100, masks=half), lambda _: gray(9)).pixels_scored == (
+        pytest.approx(0.5, rel=0.01))
+
+
+def test_the_picture_of_a_wide_lens_is_the_part_of_a_panorama_that_it_shows():
+    faces = wide_views(90)
+    pictures = PanoramaPictures(faces)
+    ((name, render, photo, mask),) = [
+        picture for view in faces[::-1]
+        for picture in pictures.take(view, view.image.astype(np.float32) / 255)]
+    assert name == "w.png"
+    height, width = photo.shape[:2]
+    assert width / height == pytest.approx(175 / 95, rel=0.05)
+    assert (photo[height // 2, width // 2] == 90).all()
+    assert 0.8 < mask.mean() < 1
+    assert render.shape == photo.shape
 
 
 def test_an_ordinary_view_is_passed_on():

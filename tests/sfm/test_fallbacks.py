@@ -22,6 +22,7 @@ from recon_cli.sfm.fallbacks import (
     shortfall,
 )
 from recon_cli.sfm.job import CameraGroup, Reporter, StepLog, parse
+from recon_cli.sfm.lens_trial import BetterLens
 from recon_cli.sfm.merge_models import ModelCandidate
 
 NAMES = tuple(f"{index:06d}.png" for index in range(60))
@@ -104,6 +105,7 @@ class Opinion:
     trusted: bool = True
     problems: tuple[str, ...] = ()
     match_parts: tuple[tuple[str, ...], ...] = ()
+    lenses: tuple[BetterLens, ...] = ()
 
 
 def candidate(capture, count=20, *, apart=(), opinion=None):
@@ -125,6 +127,22 @@ def test_each_shortfall_is_said(capture):
     assert_facts(shortfall(apart, names), 2, "disconnected models")
     broken = Opinion(trusted=False, problems=("The model is broken.",))
     assert shortfall(candidate(capture, opinion=broken), names) == "The model is broken."
+
+
+def test_a_wrong_lens_falls_short_only_where_another_may_be_tried(capture):
+    names = capture[0].names
+    lens = BetterLens(1, "OPENCV", "OPENCV_FISHEYE", 1.2, 0.7, 0.41, 0.02)
+    wrong = candidate(capture, opinion=Opinion(
+        trusted=False, problems=(lens.sentence(),), lenses=(lens,)))
+    assert shortfall(wrong, names) == ""  # no other mapper mends it
+    assert_facts(shortfall(wrong, names, lenses=True), "OPENCV_FISHEYE", "1.20", "0.70")
+    job = capture[0]
+    assert fallbacks.may_change_lenses(job, ["exhaustive"])
+    assert not fallbacks.may_change_lenses(job, ["exhaustive", "lens"])
+    named = replace(job, groups=tuple(replace(group, model="OPENCV") for group in job.groups))
+    assert not fallbacks.may_change_lenses(named, ["exhaustive"])
+    assert not fallbacks.may_change_lenses(
+        replace(job, segments=(names[:12], names[8:])), ["segments"])
 
 
 def test_a_part_that_no_match_ties_to_the_model_is_no_shortfall(capture):
@@ -227,7 +245,7 @@ def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypa
     monkeypatch.setattr(mapper, "map_incrementally", lambda *_: [
         part(truth, job.names[:10]), part(truth, job.names[10:])])
     monkeypatch.setattr(fallbacks.merge_models, "merge", lambda *_: None)
-    monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "")
+    monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "")
     result = build(job)
     assert sorted(each.registered for each in result.parts) == [job.names[:10], job.names[10:]]
     assert result.apart == ()
@@ -247,7 +265,7 @@ def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
 
 def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     job, _ = capture
-    monkeypatch.setattr(fallbacks, "shortfall", lambda *_: "the model cannot be trusted")
+    monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "the model cannot be trusted")
     result = build(job, deadline=0.0)
     assert [bool(attempt.skipped) for attempt in result.attempts] == [False, True, True]
     assert result.parts[0].registered == job.names

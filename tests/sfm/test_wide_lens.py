@@ -12,7 +12,8 @@ import pycolmap
 import pytest
 from synthetic import make_capture
 
-from recon_cli.sfm import fallbacks, matching, wide_lens
+from recon_cli.errors import SfmError
+from recon_cli.sfm import fallbacks, mapper, matching, wide_lens
 from recon_cli.sfm.job import CameraGroup, Reporter
 
 WIDTH, HEIGHT = 1024, 768
@@ -36,10 +37,10 @@ def walk(count):
     return poses
 
 
-def shots(lens, count, seed=0):
+def shots(lens, count, seed=0, points=900):
     """The poses of a walk through points on the walls of a room, and their pixels by number."""
     rng = np.random.default_rng(seed)
-    points = rng.uniform(-1, 1, (900, 3))
+    points = rng.uniform(-1, 1, (points, 3))
     axis = rng.integers(0, 3, len(points))
     points[np.arange(len(points)), axis] = np.sign(points[np.arange(len(points)), axis])
     points *= [3.0, 1.5, 3.0]
@@ -81,10 +82,10 @@ def test_few_matches_decide_nothing_unless_the_lens_is_named():
     assert wide_lens._camera(named, wide_lens.FISHEYE, 300.0).model_name == "RADIAL_FISHEYE"
 
 
-def capture_of(folder, lens, count=8):
+def capture_of(folder, lens, count=8, points=900):
     """A job whose database has the matches of a walk, and the true centres [N, 3]."""
     job, _ = make_capture(folder, frames=count)
-    poses, pictures = shots(lens, count)
+    poses, pictures = shots(lens, count, points=points)
     with pycolmap.Database.open(job.database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         opened.clear_keypoints()
@@ -115,6 +116,44 @@ def test_a_fisheye_is_mapped_as_one_and_its_distortion_is_found(tmp_path):
     found = np.array([model.find_image_with_name(name).projection_center() for name in job.names])
     motion = pycolmap.estimate_sim3d(found, centers).matrix()
     assert np.abs(found @ motion[:, :3].T + motion[:, 3] - centers).max() < 0.005
+
+
+def test_where_the_incremental_mapper_cannot_start_the_global_one_is_asked(tmp_path):
+    job, centers = capture_of(tmp_path, FISHEYE, points=60)  # fewer than COLMAP starts from
+    job = dataclasses.replace(job, matches_db=job.attempts / "own.db", groups=(
+        dataclasses.replace(job.groups[0], model="OPENCV_FISHEYE"),))
+    job.attempts.mkdir(exist_ok=True)
+    (model,) = wide_lens.map_fisheye(job, Reporter(io.BytesIO()))
+    assert mapper.map_incrementally(job, Reporter(io.BytesIO())) == []
+    assert mapper.list_registered(model) == list(job.names)
+    assert model.camera(1).model_name == "OPENCV_FISHEYE"
+    found = np.array([model.find_image_with_name(name).projection_center() for name in job.names])
+    motion = pycolmap.estimate_sim3d(found, centers).matrix()
+    assert np.abs(found @ motion[:, :3].T + motion[:, 3] - centers).max() < 0.02
+
+
+def test_a_lens_that_the_errors_show_is_mapped_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(wide_lens, "CLEARLY", np.inf)  # its matches pass for an ordinary lens
+    job, _ = capture_of(tmp_path, FISHEYE)
+    result = fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=float("inf"))
+    assert [attempt.name for attempt in result.attempts] == ["exhaustive", "lens"]
+    assert [attempt.kept for attempt in result.attempts] == [False, True]
+    assert "OPENCV_FISHEYE" in result.attempts[1].reason
+    model = pycolmap.Reconstruction(job.model)
+    assert model.camera(1).model_name == "OPENCV_FISHEYE"
+    np.testing.assert_allclose(model.camera(1).params[:4], FISHEYE[1][:4], atol=3)
+
+
+def test_a_lens_that_was_asked_for_wrongly_is_refused_with_the_right_one(tmp_path):
+    job, _ = capture_of(tmp_path, FISHEYE)
+    job = dataclasses.replace(job, groups=(dataclasses.replace(job.groups[0], model="OPENCV"),))
+    with pytest.raises(SfmError, match="OPENCV does not fit camera 1") as caught:
+        fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=float("inf"))
+    assert "recon sfm --camera-model OPENCV_FISHEYE" in caught.value.message
+    kept = fallbacks.build_model(dataclasses.replace(job, accept_weak=True),
+                                 Reporter(io.BytesIO()), deadline=float("inf"))
+    assert kept.broken == ()
+    assert kept.parts[0].registered == job.names
 
 
 def test_an_ordinary_capture_is_mapped_as_before(tmp_path):
