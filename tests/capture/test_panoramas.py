@@ -87,6 +87,25 @@ def test_cylinders_are_no_panoramas_of_the_sphere(tmp_path):
         choose_projection("room", cylinders, "auto")
 
 
+def test_a_band_of_a_panorama_without_metadata_is_no_ordinary_photo(tmp_path):
+    bands = photos(tmp_path / "a", [sphere(yaw)[30:100] for yaw in range(5)])
+    with pytest.raises(InputError, match=r"5 of the 5 .* are panoramas.* 0 of them") as error:
+        choose_projection("room", bands, "auto")
+    assert "metadata" in error.value.hint
+    assert choose_projection("room", bands, "perspective").photos == tuple(bands)
+    others = photos(tmp_path / "b", [texture(96, 128)] * 4)
+    chosen = choose_projection("room", [*bands, *others], "auto")
+    assert (chosen.panoramas, list(chosen.photos)) == (False, others)
+    assert "5 panoramas are left out" in chosen.notices[0]
+
+
+@pytest.mark.parametrize("rows", [16, 40, 60])
+def test_wide_photos_stay_photos(tmp_path, rows):
+    wide = photos(tmp_path / "a", [
+        texture(128, 256, seed=seed, coarseness=32)[:rows] for seed in range(9)])
+    assert choose_projection("room", wide, "auto").photos == tuple(wide)
+
+
 def test_what_was_asked_for_is_done(tmp_path):
     panoramas = photos(tmp_path / "a", [sphere(yaw) for yaw in range(5)], xmp=XMP)
     chosen = choose_projection("room", panoramas, "perspective")
