@@ -23,7 +23,7 @@ from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.face_frames import write_face_frames
 from recon_cli.io.images import read_png, write_png
 from recon_cli.scene.faces import Face, nearest_face, view_name
-from recon_cli.sfm.face_images import cube_warps, cut_face
+from recon_cli.sfm.face_images import PICTURES, cube_warps, cut_face
 from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.sphere import is_panorama, unit_rays
 
@@ -42,6 +42,7 @@ class FlatView:
     camera: pycolmap.Camera
     rotation: NDArray[np.float64]  # [3, 3] from the axes of the camera
     cut: Cut  # its picture from that of the frame
+    cut_mask: Cut  # its mask likewise
     own: NDArray[np.bool_]  # [H, W], the pixels that no other view of the frame is nearer to
 
     def name_for(self, frame: str) -> str:
@@ -78,7 +79,7 @@ def write_views(
         if job.masks is not None and (job.masks / name).exists():
             mask = read_png(job.masks / name)[:, :, 0]
         hidden = [None if mask is None else np.where(
-            view.cut(mask) < 128, 0, 255).astype(np.uint8) for view in flat]
+            view.cut_mask(mask) < 128, 0, 255).astype(np.uint8) for view in flat]
         shown = [view.shows(gray) for gray, view in zip(hidden, flat, strict=True)]
         original = read_png(job.frames / name)
         same = filecmp.cmp(job.frames / name, job.denoised / name, shallow=False)
@@ -121,14 +122,15 @@ def _views(
     if not is_panorama(camera):
         flat, cut = flatten(camera)
         own = np.ones((flat.height, flat.width), np.bool_)
-        return [FlatView(None, flat, np.eye(3), cut, own)]
+        return [FlatView(None, flat, np.eye(3), cut, cut, own)]
     views = []
     for face, warp in cube_warps(camera.width, camera.height):
         flat = pycolmap.Camera(
             camera_id=camera.camera_id, model="PINHOLE", width=warp.side, height=warp.side,
             params=(warp.focal, warp.focal, warp.side / 2, warp.side / 2))
         views.append(FlatView(
-            face, flat, face.rotation, partial(cut_face, warp=warp), warp.own.astype(np.bool_)))
+            face, flat, face.rotation, partial(cut_face, warp=warp, interpolation=PICTURES),
+            partial(cut_face, warp=warp), warp.own.astype(np.bool_)))
     return views
 
 
