@@ -36,7 +36,9 @@ GROW = 4  # pixels around it: cameras lean by some degrees
 
 def hide_carried(stage: Path, names: Sequence[str], ctx: IngestContext) -> None:
     """Adds the pole and what moves along to the masks of panoramas in ingest's folder."""
-    carried = find_carried([stage / store.FOLDER / name for name in names])
+    carried = find_carried(
+        [stage / store.FOLDER / name for name in names],
+        [stage / store.MASKS / name for name in names])
     if carried is not None:
         ctx.notice(
             f"{carried.mean():.0%} of each panorama is masked, because it moves along with the "
@@ -60,10 +62,14 @@ def pole_mask(width: int, height: int) -> NDArray[np.uint8]:
     return np.repeat(rows[:, None], width, axis=1)
 
 
-def find_carried(panoramas: Sequence[Path]) -> NDArray[np.bool_] | None:
+def find_carried(
+    panoramas: Sequence[Path], masks: Sequence[Path] = ()
+) -> NDArray[np.bool_] | None:  # [h, w]
     """Returns where panoramas show what moves along with the camera, at `SIZE`; None if nowhere.
 
-    They are in the order in which they were taken, as far as that is known.
+    They are in the order in which they were taken, as far as that is known. Where most have a mask
+    that hides a place, as beyond a crop, nothing is told of it. A mask that is not there hides
+    nothing.
     """
     if len(panoramas) < MIN_PANORAMAS:
         return None
@@ -72,7 +78,11 @@ def find_carried(panoramas: Sequence[Path]) -> NDArray[np.bool_] | None:
     change = np.sqrt((steps**2).sum(axis=2))
     wrapped = np.concatenate([change[:, -SMOOTH:], change, change[:, :SMOOTH]], axis=1)
     change = cv2.blur(wrapped, (SMOOTH, SMOOTH))[:, SMOOTH:-SMOOTH]
-    share = change / np.maximum(np.median(change, axis=1, keepdims=True), 1e-6)
+    hidden = _find_hidden(masks)
+    usual = [np.median(row[seen]) if seen.any() else np.inf
+             for row, seen in zip(change, ~hidden, strict=True)]
+    share = change / np.maximum(usual, 1e-6)[:, None]
+    share[hidden] = np.inf
     share[:round((90 - HIGHEST_DEG) / 180 * SIZE[1])] = np.inf
     # twice beside itself, so that an area across the seam is one
     near = np.concatenate([share, share], axis=1) < ADJOINING
@@ -92,3 +102,13 @@ def _read_colours(path: Path) -> NDArray[np.float32]:
     """Returns the colours of a panorama, L*a*b*, reduced to `SIZE`, [h, w, 3]."""
     small = cv2.resize(read_png(path), SIZE, interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
+
+
+def _find_hidden(masks: Sequence[Path]) -> NDArray[np.bool_]:  # [h, w]
+    """Returns which places of panoramas at `SIZE` most of these masks hide, or one beside them."""
+    hidden = np.zeros(SIZE[::-1])
+    for path in filter(Path.exists, masks):
+        small = cv2.resize(read_png(path)[..., 0], SIZE, interpolation=cv2.INTER_AREA)
+        hidden += small < 255
+    most = (hidden > len(masks) / 2).astype(np.uint8)
+    return np.asarray(cv2.dilate(most, np.ones((SMOOTH, SMOOTH), np.uint8)), np.bool_)

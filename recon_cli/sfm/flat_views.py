@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.faces import Face, grid_faces, nearest_face, pixel_rays
-from recon_cli.sfm.face_images import cube_warps, cut_face
+from recon_cli.sfm.face_images import PICTURES, cube_warps, cut_face
 from recon_cli.sfm.sphere import is_panorama, unit_rays
 
 # Share of a frame that one undistorted picture may lose; of more, faces are made.
@@ -48,12 +48,13 @@ class FlatView:
     cut: Cut  # its picture from that of the frame
     own: NDArray[np.bool_]  # [H, W], the pixels that no other view of the frame is nearer to
     inside: NDArray[np.bool_] | None = None  # [H, W], those that the frame shows; None for all
+    cut_linear: Cut | None = None  # by bilinear pixels, for masks; None where `cut` does so
 
     def cut_mask(self, mask: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
         """Returns its mask from that of the frame, [H, W]: 255 where pixels count; None for all."""
         if mask is None:
             return None if self.inside is None else self.inside * np.uint8(255)
-        counts = self.cut(mask) >= 128
+        counts = (self.cut_linear or self.cut)(mask) >= 128
         return np.where(counts if self.inside is None else counts & self.inside,
                         np.uint8(255), np.uint8(0))
 
@@ -124,7 +125,8 @@ def _cube_views(camera: pycolmap.Camera) -> list[FlatView]:
             camera_id=camera.camera_id, model="PINHOLE", width=warp.side, height=warp.side,
             params=(warp.focal, warp.focal, warp.side / 2, warp.side / 2))
         views.append(FlatView(
-            face, flat, face.rotation, partial(cut_face, warp=warp), warp.own.astype(np.bool_)))
+            face, flat, face.rotation, partial(cut_face, warp=warp, interpolation=PICTURES),
+            warp.own.astype(np.bool_), cut_linear=partial(cut_face, warp=warp)))
     return views
 
 

@@ -34,6 +34,9 @@ Names = tuple[str, ...]
 # scene, and fewer than 10 cannot tell the principal point (`limits`).
 FEWEST_FRAMES, WORTH_FRAMES = MIN_IMAGES_PRINCIPAL, 20
 _MOST_NAMED = 5  # parts in an error
+JOIN_PANORAMAS = (
+    "To join panoramas that do not overlap, add some between them, half a metre apart: in a "
+    "doorway and on either side of it.")
 
 
 def deliver_parts(
@@ -43,8 +46,8 @@ def deliver_parts(
 
     `others` are models beside the largest one, `model`. --accept-weak and --no-partial keep that as
     it is.
-    SfmError if the parts hold less than --min-registered of the frames together, or show them from
-    nearly one place.
+    SfmError if the parts hold less than --min-registered of the frames together (`frames_asked`),
+    or show them from nearly one place.
     """
     parts = [model]
     if cuts_models(job):
@@ -52,7 +55,8 @@ def deliver_parts(
         parts = [part for part in found if checks.shows_depth(_angle(part))] or found[:1]
         _check_share(job, model.verdict, parts)
     checks.check_registered(
-        job.names, [name for part in parts for name in mapper.list_registered(part.model)],
+        frames_asked(job, model.verdict),
+        [name for part in parts for name in mapper.list_registered(part.model)],
         job.min_registered)
     checks.check_parallax(_angle(parts[0]))
     check_weak_link(parts[0].verdict, job.accept_weak)
@@ -69,6 +73,18 @@ def least_frames(job: MappingJob) -> int:
     if job.panoramas:
         return MIN_FRAMES
     return min(max(len(job.names) // 10, FEWEST_FRAMES), WORTH_FRAMES)
+
+
+def frames_asked(job: MappingJob, verdict: ModelVerdict) -> Names:
+    """Returns the frames of which --min-registered asks for a share.
+
+    A panorama shows a room by itself, and few overlap through doors. One that does not match two
+    others, directly or through others, cannot be placed; it tells nothing against those that are.
+    """
+    if not job.panoramas:
+        return tuple(job.names)
+    return tuple(sorted(name for names in verdict.match_parts if len(names) >= MIN_FRAMES
+                        for name in names))
 
 
 def find_parts(
@@ -119,19 +135,22 @@ def _check_share(
 ) -> None:
     """Raises SfmError if the parts of a broken capture hold too few frames together."""
     held = [mapper.list_registered(part.model) for part in parts]
-    count = sum(map(len, held))
+    count, asked = sum(map(len, held)), frames_asked(job, verdict)
     broken = bool(verdict.problems) or len(parts) > 1
-    if parts and (count >= job.min_registered * len(job.names) or not broken):
+    if parts and (count >= job.min_registered * len(asked) or not broken):
         return
+    more = JOIN_PANORAMAS if job.panoramas else (
+        "Use more frames between the parts (`recon ingest --frames N`), or match all of them "
+        "(--pairs exhaustive).")
     named = "; ".join(f"{len(names)} ({names[0]} to {names[-1]})" for names in held[:_MOST_NAMED])
     problem = (verdict.problems or ("The capture split into disconnected models.",))[0]
     raise SfmError(
-        f"{problem} The parts that can be trusted on their own hold {count} of {len(job.names)} "
-        f"frames together{f', {named}' if named else ''}, but --min-registered asks for "
+        f"{problem} The parts that can be trusted on their own hold {count} of {len(asked)} "
+        f"frames{' that match others' if len(asked) < len(job.names) else ''} "
+        f"together{f', {named}' if named else ''}, but --min-registered asks for "
         f"{job.min_registered:.0%}.",
-        hint="Use more frames between the parts (`recon ingest --frames N`), match all of "
-        "them (--pairs exhaustive), accept the parts with a lower --min-registered, or keep the "
-        "largest model as it is with --accept-weak.")
+        hint=f"{more} Or accept the parts with a lower --min-registered, or keep the largest model "
+        "as it is with --accept-weak.")
 
 
 def _sides(job: MappingJob, cameras: Collection[str], verdict: ModelVerdict) -> Iterator[Names]:

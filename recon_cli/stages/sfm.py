@@ -19,6 +19,7 @@ from recon_cli.sfm import database, parts, process, segments
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
 from recon_cli.sfm.results import MappingResult
 from recon_cli.sfm.time_estimate import Workload, estimate_for_notice, format_minutes
+from recon_cli.sfm.trusted_part import JOIN_PANORAMAS
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import (
     POSES,
@@ -269,6 +270,9 @@ def _describe_left_out(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
     if missing and not summary.lines:  # the verdict names them, and why
         yield (f"Left out without a camera: {len(missing)} of {summary.frames} frames, "
                f"{_stretches(frames, missing)}.")
+    if missing and any(group.lens is not None and group.lens.is_panorama
+                       for group in frames.groups):
+        yield JOIN_PANORAMAS
     if held_out:
         yield (f"Held-out frames without a camera, which cannot be scored ({len(held_out)}): "
                f"{list_names(held_out)}.")

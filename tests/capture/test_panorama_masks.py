@@ -13,6 +13,7 @@ WIDTH, HEIGHT = 480, 240
 def rooms(folder, *, count=20, operator=True, seed=0):
     """Panoramas of changing walls; behind the camera, at both edges, somebody in dark blue."""
     rng = np.random.default_rng(seed)
+    folder.mkdir(exist_ok=True)
     paths = []
     for index in range(count):
         picture = cv2.resize(
@@ -48,6 +49,42 @@ def test_a_ceiling_that_looks_the_same_everywhere_stays(tmp_path):
         picture[:70] = 200
         write_png(path, picture)
     assert find_carried(paths) is None
+
+
+def crop(paths, folder, *, rows=slice(60, 170), columns=slice(None)):
+    """Blackens panoramas beyond a crop; returns the masks that say so."""
+    masks = []
+    for path in paths:
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[rows, columns] = 255
+        write_png(path, np.where(mask[..., None] > 0, cv2.imread(str(path))[..., ::-1], 0))
+        masks.append(folder / f"mask_{path.name}")
+        write_png(masks[-1], mask)
+    return masks
+
+
+@pytest.mark.parametrize("columns", [slice(None), slice(100, 400)])
+def test_what_a_crop_leaves_black_moves_along_with_nobody(tmp_path, columns):
+    paths = rooms(tmp_path, operator=False)
+    masks = crop(paths, tmp_path, columns=columns)
+    assert find_carried(paths, masks) is None
+    assert find_carried(paths) is not None  # it is the masks that tell
+
+
+def test_whoever_carries_the_camera_is_found_in_cropped_panoramas(tmp_path):
+    paths = rooms(tmp_path)
+    carried = find_carried(paths, crop(paths, tmp_path))
+    assert carried is not None
+    assert carried[35:80, :12].mean() > 0.95
+    assert carried[35:80, -12:].mean() > 0.95
+    assert not carried[:, 40:-40].any()
+
+
+def test_a_few_masks_hide_nothing_of_the_others(tmp_path):
+    paths = rooms(tmp_path)
+    few = crop(rooms(tmp_path / "few", count=6), tmp_path, rows=slice(0, 40))
+    missing = [tmp_path / "none.png"] * (len(paths) - len(few))
+    np.testing.assert_array_equal(find_carried(paths, [*few, *missing]), find_carried(paths))
 
 
 @pytest.mark.parametrize("height", [90, 768])

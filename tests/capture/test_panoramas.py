@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from media import texture
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from recon_cli.capture.images import inspect_photo
 from recon_cli.capture.panoramas import (
@@ -19,13 +20,14 @@ XMP = b'<r GPano:ProjectionType="equirectangular"/>'
 WAVES = np.random.default_rng(0).normal(scale=6, size=(3, 3))
 
 
-def sphere(yaw, *, width=256):
-    """Returns a panorama of coloured waves on a sphere, turned by `yaw`."""
+def sphere(yaw, *, width=256, turn=None):
+    """Returns a panorama of coloured waves on a sphere, turned by `yaw` and by a rotation."""
     longitude = (np.arange(width) + 0.5) / width * 2 * np.pi + yaw
     latitude = np.pi / 2 - (np.arange(width // 2) + 0.5) / (width // 2) * np.pi
     rays = np.stack([
         np.cos(latitude)[:, None] * np.sin(longitude), np.sin(latitude)[:, None] + 0 * longitude,
         np.cos(latitude)[:, None] * np.cos(longitude)], -1)
+    rays = rays if turn is None else rays @ turn
     return np.rint(127 + 100 * np.sin(rays @ WAVES)).astype(np.uint8)
 
 
@@ -42,6 +44,12 @@ def test_a_panorama_ends_where_it_begins_and_a_photo_does_not():
     for seed in range(20):
         assert not wraps_around(texture(128, 256, seed=seed, coarseness=32))
     assert not wraps_around(np.full((128, 256, 3), 90, np.uint8))  # a wall is like itself
+
+
+def test_a_panorama_whose_horizon_is_not_level_is_one_too():
+    quats = np.random.default_rng(0).normal(size=(30, 4))
+    for turn in Rotation.from_quat(quats).as_matrix():
+        assert wraps_around(sphere(0.0, turn=turn))
 
 
 def test_panoramas_are_told_by_their_metadata(tmp_path):
@@ -85,6 +93,25 @@ def test_cylinders_are_no_panoramas_of_the_sphere(tmp_path):
     cylinders = photos(tmp_path / "a", [texture(64, 128)] * 4, xmp=xmp)
     with pytest.raises(InputError, match="0 of them are equirectangular"):
         choose_projection("room", cylinders, "auto")
+
+
+def test_a_band_of_a_panorama_without_metadata_is_no_ordinary_photo(tmp_path):
+    bands = photos(tmp_path / "a", [sphere(yaw)[30:100] for yaw in range(5)])
+    with pytest.raises(InputError, match=r"5 of the 5 .* are panoramas.* 0 of them") as error:
+        choose_projection("room", bands, "auto")
+    assert "metadata" in error.value.hint
+    assert choose_projection("room", bands, "perspective").photos == tuple(bands)
+    others = photos(tmp_path / "b", [texture(96, 128)] * 4)
+    chosen = choose_projection("room", [*bands, *others], "auto")
+    assert (chosen.panoramas, list(chosen.photos)) == (False, others)
+    assert "5 panoramas are left out" in chosen.notices[0]
+
+
+@pytest.mark.parametrize("rows", [16, 40, 60])
+def test_wide_photos_stay_photos(tmp_path, rows):
+    wide = photos(tmp_path / "a", [
+        texture(128, 256, seed=seed, coarseness=32)[:rows] for seed in range(9)])
+    assert choose_projection("room", wide, "auto").photos == tuple(wide)
 
 
 def test_what_was_asked_for_is_done(tmp_path):

@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import pycolmap
+import pytest
 from panoramas import make_panoramas
 
+from recon_cli.errors import SfmError
 from recon_cli.sfm import mapper, matching
 from recon_cli.sfm.fallbacks import describe_other_rooms, list_fallbacks
 from recon_cli.sfm.limits import MIN_FRAMES, MIN_PANORAMA_SHARE
 from recon_cli.sfm.merge_models import ModelCandidate
-from recon_cli.sfm.trusted_part import least_frames
+from recon_cli.sfm.trusted_part import deliver_parts, frames_asked, least_frames
 from recon_cli.sfm.verdict import examine
 
 
@@ -33,6 +35,36 @@ def test_three_panoramas_are_a_part(tmp_path):
     job, _ = make_panoramas(tmp_path, frames=4, points=40)
     assert least_frames(job) == MIN_FRAMES
     assert least_frames(replace(job, groups=(replace(job.groups[0], lens=None),))) > MIN_FRAMES
+
+
+def rooms(tmp_path, *parts, **changes):
+    """Returns a job, and a true model of the first part, of panoramas that match in these parts."""
+    job, model = make_panoramas(tmp_path)
+    for name in set(job.names).difference(parts[0]):
+        model.deregister_frame(model.find_image_with_name(name).frame_id)
+    verdict = replace(examine(model, job.database, job.names), match_parts=parts)
+    assert verdict.trusted
+    return replace(job, **changes), ModelCandidate(model, verdict, (), {})
+
+
+def test_panoramas_that_match_no_two_others_do_not_count_against_a_room(tmp_path):
+    names = make_panoramas(tmp_path / "a")[0].names
+    alone = [(name,) for name in names[6:]]
+    job, room = rooms(tmp_path / "b", names[:4], names[4:6], *alone, min_registered=0.5)
+    assert frames_asked(job, room.verdict) == names[:4]
+    part, = deliver_parts(job, room)
+    assert part.model.num_reg_images() == 4
+    photos = replace(job, groups=(replace(job.groups[0], lens=None),))
+    assert frames_asked(photos, room.verdict) == names
+
+
+def test_a_room_whose_panoramas_should_have_been_placed_counts(tmp_path):
+    names = make_panoramas(tmp_path / "a")[0].names
+    job, room = rooms(tmp_path / "b", names[:4], names[4:11], names[11:], min_registered=0.5)
+    with pytest.raises(SfmError, match="Only 4 of 11") as refused:
+        deliver_parts(job, room)
+    assert "--min-registered" in refused.value.hint
+    assert len(deliver_parts(replace(job, min_registered=0.3), room)) == 1
 
 
 def test_many_panoramas_are_matched_as_they_look_alike_and_not_by_a_skeleton(tmp_path):

@@ -272,6 +272,19 @@ def toured(path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("width", [360, 390])
+def test_all_buttons_of_a_tour_fit_a_phone_with_their_words(page, tmp_path, width):
+    opened(page, toured(tmp_path / "a.html"))
+    page.page.set_viewport_size({"width": width, "height": 640})
+    page.page.evaluate("recon.settled()")
+    for name in ("play", "speed", "reset", "mode", "before", "after", "ask"):
+        box = page.page.locator(f"#{name}").bounding_box()
+        assert 0 <= box["x"] <= box["x"] + box["width"] <= width
+        assert min(box["width"], box["height"]) >= 32  # a finger hits it
+        inside = page.page.locator(f"#{name}").evaluate("e => e.clientWidth - e.scrollWidth")
+        assert inside >= 0  # no word is cut off
+
+
 def test_a_page_opens_where_its_tour_starts_and_returns_there(page, tmp_path):
     path = toured(tmp_path / "a.html")
     opened(page, path)
