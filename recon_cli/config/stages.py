@@ -219,6 +219,9 @@ class TrainConfig(StageConfig):
     exposure: str = option(
         "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
         choices=("auto", "on", "off"))
+    moving: str = option(
+        "auto", "Mask people and things that move; auto: where views contradict the others.",
+        choices=("auto", "on", "off"), late=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -390,6 +393,9 @@ class ImportConfig(StageConfig):
         automatic="as the file states, else y-down, as in viewers")
     max_size: int = option(
         600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
+    moving: str = option(
+        "auto", "Mask people and things that move; auto: where views contradict the others.",
+        choices=("auto", "on", "off"), late=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
 
 

@@ -53,9 +53,9 @@ def compare_view(
     depth = render_surface(splats, small.camera, backend=backend).depth.cpu().numpy()
     photo = (small.image / 255).astype(np.float32)
     counts = np.ones(photo.shape[:2], np.bool_) if small.mask is None else small.mask
+    error = (photo - rgb * _median_gain(rgb, photo, counts)) * counts[..., None]
     return ComparedView(
-        small.camera, _smooth((photo - rgb * _median_gain(rgb, photo, counts)) * counts[..., None]),
-        np.asarray(depth, np.float32), counts)
+        small.camera, _smooth(np.asarray(error, np.float32)), np.asarray(depth, np.float32), counts)
 
 
 def _median_gain(
@@ -131,7 +131,8 @@ def _sees(view: ComparedView, where: NDArray[np.float64]) -> NDArray[np.bool_]:
 class Contradiction:
     """How much a view differs from what others show of the same surfaces."""
 
-    amount: NDArray[np.float32]  # [H, W] error beyond the others' median error, 0 to 1
+    # [H, W] error beyond the others' median error, 0 to 1; where too few see the surface, all of it
+    amount: NDArray[np.float32]
     spread: NDArray[np.float32]  # [H, W] how far the others differ from their median
     seen: NDArray[np.int64]  # [H, W] others that see the surface
 
@@ -142,7 +143,7 @@ def contradict(
     """Returns how `own` contradicts those of `views` that `others` names."""
     height, width = own.depth.shape
     pixels = np.flatnonzero(own.depth.reshape(-1) > 0)
-    amount, spread = np.zeros((2, height * width), np.float32)
+    amount, spread = _length(own.error).reshape(-1), np.zeros(height * width, np.float32)
     seen = np.zeros(height * width, np.int64)
     if not len(pixels) or not len(others):
         return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
@@ -191,7 +192,8 @@ def _sample(
 # A region begins where the contradiction is beyond all noise and ends where it is no more. Noise is
 # the capture's own: the median over all pixels of all views.
 _STRONG, _WEAK = 8.0, 3.0  # times the noise
-_LEAST_STRONG, _LEAST_WEAK = 0.10, 0.04  # of the brightness; a shadow takes a fifth
+# Of the brightness. A shadow begins faintly: what is fainter than _TELLS only adds to a region.
+_LEAST_STRONG, _TELLS, _LEAST_WEAK = 0.10, 0.04, 0.025
 _BEYOND = 3.0  # times the spread of the others
 _AREA = 0.004  # of a view's pixels; smaller regions are errors of the model
 _THICK = 2.0  # pixels from the middle of a region to its border; edges of things are thin
@@ -238,9 +240,10 @@ def find_regions(found: Contradiction, noise: float) -> NDArray[np.bool_]:
     result = np.zeros(weak.shape, np.bool_)
     for label in range(1, count):
         region = labels == label
-        told = region & (found.seen >= _LEAST)
+        # what others do not see belongs to a region that they contradict, and makes none
+        told = region & (found.seen >= _LEAST) & (found.amount >= _TELLS)
         if (stats[label, cv2.CC_STAT_AREA] >= _AREA * region.size
-                and np.count_nonzero(region & strong) >= _AREA * region.size / 4
+                and np.count_nonzero(told & strong) >= _AREA * region.size / 4
                 and inside[region].max() >= _THICK
                 and np.median(ratio[told]) >= _AGREED
                 and np.quantile(found.amount[told], 0.9) >= _CLEAR
