@@ -79,6 +79,7 @@ def _(train: TrainSummary) -> str:
         f"{_validation(train.validation_psnr_db)}",
         f"stopped early, {train.planned_iterations:,} were planned" if early else "",
         f"continued from {train.imported_from}" if train.imported_from else "",
+        f"{train.moving.share:.1%} of the pixels masked, as they move" if train.moving else "",
         f"{format_count(train.skipped_steps, 'step')} skipped" if train.skipped_steps else ""])
 
 

@@ -225,6 +225,9 @@ class TrainConfig(StageConfig):
         "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
         "budget, unless a trial shows a loss.",
         choices=("auto", "on", "off"), late=True, expert=True)
+    moving: str = option(
+        "auto", "Mask people and things that move; auto: where views contradict the others.",
+        choices=("auto", "on", "off"), late=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -396,6 +399,9 @@ class ImportConfig(StageConfig):
         automatic="as the file states, else y-down, as in viewers")
     max_size: int = option(
         600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
+    moving: str = option(
+        "auto", "Mask people and things that move; auto: where views contradict the others.",
+        choices=("auto", "on", "off"), late=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
 
 

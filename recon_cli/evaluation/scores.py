@@ -59,6 +59,8 @@ class ModelMetrics(JsonRecord):
     train_seconds: float | None  # of training that led to it; None where unknown
     gain_psnr_db: float | None = None  # after the best gain of each view, with --exposure
     seen_psnr_db: Mapping[str, float] = field(default_factory=dict)  # on training views, by split
+    # beside what moves in the held-out views, where training masked what moves
+    static_psnr_db: float | None = None
     views: tuple[ViewScore, ...]
 
     @classmethod
@@ -76,7 +78,7 @@ class ModelMetrics(JsonRecord):
     def from_views(
         cls, views: tuple[ViewScore, ...], *, gaussians: int, bytes: int, render_ms: float,
         train_seconds: float | None = None, gain_psnr_db: float | None = None,
-        seen_psnr_db: Mapping[str, float] | None = None,
+        seen_psnr_db: Mapping[str, float] | None = None, static_psnr_db: float | None = None,
     ) -> Self:
         """Returns the scores of a model from those of its views."""
         psnr_db, psnr_8bit_db, ssim, ssim_padded = (
@@ -86,7 +88,8 @@ class ModelMetrics(JsonRecord):
             psnr_db=psnr_db, psnr_8bit_db=psnr_8bit_db, ssim=ssim, ssim_padded=ssim_padded,
             lpips=float(np.mean(lpips)) if len(lpips) == len(views) else None,
             gaussians=gaussians, bytes=bytes, render_ms=render_ms, train_seconds=train_seconds,
-            gain_psnr_db=gain_psnr_db, seen_psnr_db=seen_psnr_db or {}, views=views)
+            gain_psnr_db=gain_psnr_db, seen_psnr_db=seen_psnr_db or {},
+            static_psnr_db=static_psnr_db, views=views)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +119,17 @@ class Metrics(JsonRecord):
     frames: int | None = None  # of ingest; None, as the next two, in files of older versions
     training_views: int | None = None  # None for an imported scene, too
     unregistered: tuple[str, ...] | None = None  # names of all frames without a camera
+    # share of the pixels of held-out views that move, by name, where training masked what moves;
+    # the scores are of all pixels but `static_psnr_db`
+    moving: Mapping[str, float] | None = None
+
+    def describe_moving(self, model: ModelMetrics) -> str:
+        """Returns a sentence on what moves in the held-out views; empty where nothing does."""
+        if not self.moving or model.static_psnr_db is None:
+            return ""
+        names = ", ".join(f"{name} ({share:.1%})" for name, share in self.moving.items())
+        return (f"PSNR outside what moves {model.static_psnr_db:.2f} dB, of all pixels "
+                f"{model.psnr_db:.2f} dB; something moves in {names}")
 
     @property
     def coverage(self) -> str:

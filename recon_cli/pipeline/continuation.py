@@ -138,7 +138,8 @@ def _obstacles(
     """Returns in words why a run of `key` does not prolong a finished one."""
     reasons = differences(_without_length(finished.key), _without_length(key), section=row.name,
                           late=row.config.late_fields())
-    reasons += find_changed_outputs(workspace.folder(row.name), finished, row.volatile)
+    reasons += find_changed_outputs(
+        workspace.folder(row.name), finished, row.volatile, edits=row.edits)
     if finished.run.summary.get("blocks"):
         reasons.append("the finished run was trained in blocks")
     if protocol := key.config.get("protocol"):

@@ -125,7 +125,7 @@ def _find_earlier(
         finished = workspace.manifest(row.name)
     except ManifestError:
         return EarlierResult(folder, {}) if row.adds else None
-    if finished is None or not (row.adds or (row.late and not again and (
+    if finished is None or not (row.adds or row.edits or (row.late and not again and (
             _without(finished.key, row.late) == _without(key, row.late)))):
         return None
     present = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")

@@ -173,7 +173,7 @@ class WorkspaceCheck:
             manifest.key, expected, section=layers.section_of(row.config),
             without=row.config.per_file_fields(), late=row.config.late_fields())
         reasons += find_changed_outputs(
-            self._workspace.folder(row.name), manifest, row.volatile, row.states)
+            self._workspace.folder(row.name), manifest, row.volatile, row.states, row.edits)
         try:  # another version may have written another record
             summary = row.summary.from_json(manifest.run.summary)
             reasons += summary.contradictions(dataclasses.asdict(config))

@@ -30,6 +30,7 @@ from recon_cli.report.gallery import (
     legend_stops,
 )
 from recon_cli.report.headline import build_headline, format_facts
+from recon_cli.report.moving_section import read_moving
 from recon_cli.report.opening import build_opening
 from recon_cli.report.parts import read_parts
 from recon_cli.report.records import build_scores, read_metrics
@@ -130,6 +131,7 @@ def _template_values(
         "parts": read_parts(stages),
         "trust": read_trust(stages),
         "curves": draw_training_curves(stages, metrics),
+        "moving": read_moving(stages),
         "decisions": read_decisions(stages["train"]), "damaged": damaged,
         "delivered": delivered_model(metrics),
         "scores": build_scores(metrics) if metrics and metrics.models else None,

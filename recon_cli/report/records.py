@@ -78,6 +78,8 @@ def build_scores(metrics: Metrics) -> Scores:
     if metrics.masked_out_test:
         notes.append(f"Masks leave too little of {len(metrics.masked_out_test)} held-out views: "
                      f"{', '.join(metrics.masked_out_test)}.")
+    notes += [f"{MODEL_LABELS[key].capitalize()}: {moving}." for key, model in models.items()
+              if (moving := metrics.describe_moving(model))]
     conventions = {title: getattr(metrics, f"{key}_convention") for key, title in _TITLES.items()}
     return Scores(
         _model_table(models), _gap_table(models),

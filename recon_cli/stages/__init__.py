@@ -57,6 +57,9 @@ class Stage:
     # options that decide its last steps alone: where they are all that differs, it is given its
     # last result to continue
     late: tuple[str, ...] = ()
+    # folder of outputs that a user may change, remove or add: the next run is given its last result
+    # to read them from
+    edits: str = ""
 
 
 STAGES: tuple[Stage, ...] = (
@@ -70,7 +73,7 @@ STAGES: tuple[Stage, ...] = (
           own_digests=True, late=("part", "gravity", "scale_between")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 5, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"),
-          states=("mid.safetensors", "final.safetensors"), renders=True),
+          states=("mid.safetensors", "final.safetensors"), renders=True, edits="masks"),
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), from_states=("train",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig,

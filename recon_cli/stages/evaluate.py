@@ -9,7 +9,7 @@ scored: they are painted in one colour in truth/ and black in difference/.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from recon_cli.evaluation.metrics import (
     MASK_CONVENTION,
     Perceptual,
     load_lpips,
+    psnr,
 )
 from recon_cli.evaluation.panoramas import PanoramaPictures
 from recon_cli.evaluation.reference_views import (
@@ -51,7 +52,11 @@ from recon_cli.io.images import to_uint8, write_png
 from recon_cli.io.training_scene import load_scene
 from recon_cli.io.views import ReferenceView, evenly_spread, size_summary, sizes_of
 from recon_cli.scene.scene import Scene
+from recon_cli.scene.train_view import leaves_enough
 from recon_cli.splats.ply import read_ply
+from recon_cli.train.moving import SIDE
+from recon_cli.train.moving_masks import read_summary, with_masks
+from recon_cli.train.moving_search import FINER, Judge, find_in_held_out
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.assess import TrustTask, assess
@@ -80,6 +85,8 @@ class _Evaluation:
     training_views: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
     ctx: StageContext
     protocol: str | None = None  # that training and scores follow
+    # [H, W] where held-out views show what moves, by name; only where training masked such things
+    moving: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     @property
     def gains(self) -> bool:
@@ -97,7 +104,11 @@ class _Evaluation:
 
         pictures = PanoramaPictures(self.held_out)
 
+        static: list[float] = []
+
         def save(view: ReferenceView, image: NDArray[np.float32]) -> None:
+            if self.moving:
+                static.append(psnr(image, view.image, self._static(view)))
             for name, rendered, photo, mask in pictures.take(view, image):
                 _save_pictures(self.out, model, name, rendered, photo, mask)
             on_view()
@@ -114,7 +125,15 @@ class _Evaluation:
         return ModelMetrics.from_views(
             scores.views, gaussians=len(splats), bytes=path.stat().st_size,
             render_ms=scores.render_ms, train_seconds=seconds,
-            gain_psnr_db=scores.corrected_db if self.gains else None, seen_psnr_db=seen_db)
+            gain_psnr_db=scores.corrected_db if self.gains else None, seen_psnr_db=seen_db,
+            static_psnr_db=float(np.mean(static)) if static else None)
+
+    def _static(self, view: ReferenceView) -> NDArray[np.bool_] | None:
+        """Returns the pixels of a held-out view that are scored and do not move, None for all."""
+        region = self.moving.get(view.name)
+        if region is None:
+            return view.mask
+        return ~region if view.mask is None else view.mask & ~region
 
     def counts(self) -> dict[str, Any]:
         """Returns how many views are scored, and the names of those that are not, for records."""
@@ -206,7 +225,27 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
     return _Evaluation(
         out, folders, train_config, record,
         read_frame_list(inputs.folders["ingest"]).frames, scene, held_out, training_views, ctx,
-        train_config.protocol if followed else None)
+        train_config.protocol if followed else None,
+        _find_moving(inputs.folders["train"], train_config, scene, held_out, ctx))
+
+
+def _find_moving(
+    train: Path, config: RunConfig, scene: Scene, held_out: Sequence[ReferenceView],
+    ctx: StageContext,
+) -> dict[str, NDArray[np.bool_]]:
+    """Returns where held-out views show what moves, [H, W] by name, if training masked any.
+
+    Faces of panoramas are scored together, and not looked at.
+    """
+    summary = read_summary(train)
+    if summary is None or any(view.face_of for view in held_out):
+        return {}
+    splats = read_ply(train / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
+    training = load_reference_views(
+        with_masks(scene, train).train, FINER * SIDE, threads=ctx.threads)
+    regions = find_in_held_out(splats, held_out, training, Judge(config.sh_degree, ctx.backend))
+    return {view.name: region for view, region in zip(held_out, regions, strict=True)
+            if region.any() and leaves_enough(~region)}
 
 
 def _save_pictures(
@@ -248,7 +287,9 @@ def _write(
         imported_from=evaluation.import_record.file if evaluation.import_record else None,
         base_recipe=REFERENCE if evaluation.config.is_reference and not (
             evaluation.import_record) else None,
-        protocol=evaluation.protocol, **evaluation.coverage())
+        protocol=evaluation.protocol, **evaluation.coverage(),
+        moving={name: round(float(region.mean()), 4) for name, region in sorted(
+            evaluation.moving.items())} or None)
     write_json(out / Metrics.FILE, metrics.to_json())
     by_label = {metrics.label(name): model for name, model in models.items()}
     note = evaluation.note(lacking)
@@ -260,6 +301,8 @@ def _write(
             note += (f"{label}, after the best gain per channel of each view: "
                      f"{model.gain_psnr_db:.2f} dB\n")
         note += f"{label}, {_gap(model)}\n"
+        if moving := metrics.describe_moving(model):
+            note += f"{label}, {moving}\n"
     if differences:
         note += (f"compact minus original: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
                  f"{differences['ssim'].text('+.4f')} (95% by bootstrap over the views)\n")

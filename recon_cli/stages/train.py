@@ -8,20 +8,31 @@ trained in blocks, by jobs of their own, and has no state at the end: its blocks
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, format_count, list_names
 from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.scene import Scene
 from recon_cli.train import blocks
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.merge_blocks import merge_blocks
+from recon_cli.train.moving_masks import (
+    EditedMasks,
+    join_masks,
+    masked_views,
+    read_summary,
+    with_masks,
+    write_masks,
+)
 from recon_cli.train.one_model import fit_scene
 from recon_cli.train.protocol import fit_protocol
 from recon_cli.workspace.records import read_frame_list
 from recon_cli.workspace.summaries import TrainSummary
+
+_NAMES = 5  # of masks without a view, in a notice
 
 
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
@@ -34,9 +45,13 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
             f"The protocol {config.protocol} starts from the points of sfm, not from a scene.",
             hint="Leave out --from-import or --protocol.")
     count = _count_blocks(config, scene, model, ctx)
+    edited = EditedMasks() if model is not None else EditedMasks.find(inputs.earlier)
+    if unused := edited.unused(masked_views(scene)):
+        ctx.notice(f"{format_count(len(unused), 'mask')} in train/masks of no view that training "
+                   f"reads: {list_names(unused, _NAMES)}")
     if count > 1:
-        return _train_in_blocks(config, count, scene, inputs, out, ctx)
-    return fit_scene(config, scene, out, ctx, model)
+        return _train_in_blocks(config, count, scene, inputs, out, ctx, edited)
+    return fit_scene(config, scene, out, ctx, model, edited)
 
 
 def _count_blocks(
@@ -63,10 +78,12 @@ def _count_blocks(
 
 def _train_in_blocks(
     config: TrainConfig, count: int, scene: Scene, inputs: StageInputs, out: Path,
-    ctx: StageContext,
+    ctx: StageContext, edited: EditedMasks,
 ) -> TrainSummary:
+    write_masks(out, scene, None, edited)  # which the blocks read
     jobs = blocks.cut_blocks(config, count, scene, inputs, out)
     blocks.train_blocks(jobs, config, ctx)
-    summary = merge_blocks(jobs, scene, out, ctx)
+    join_masks(out, [job.model for job in jobs], scene)
+    summary = merge_blocks(jobs, with_masks(scene, out), out, ctx)
     blocks.remove_blocks(out)
-    return summary
+    return dataclasses.replace(summary, moving=read_summary(out))

@@ -38,6 +38,7 @@ from recon_cli.scene.covisibility import (
     views_of_block,
 )
 from recon_cli.scene.scene import Scene
+from recon_cli.train.moving_masks import with_masks
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import digest_outputs, sha256_json
@@ -159,6 +160,7 @@ class BlockJob:
             self.inputs.folders["sfm"] / "undistorted" / "sparse", part, self.views,
             context_points(self.cell.owned, self.config.seed))
         scene = load_scene(self.inputs.folders, validation=self.validation, sparse=part)
+        scene = with_masks(scene, self.folder.parent.parent)  # those that a user has edited
         return dataclasses.replace(scene, cell=self.cell)
 
 

@@ -24,11 +24,22 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
-from recon_cli.scene.train_view import TrainView
+from recon_cli.scene.splats import Splats
+from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.train.background import FarContent, faces, far_content, look_at_one_thing
 from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
+from recon_cli.train.moving import SIDE
+from recon_cli.train.moving_search import (
+    Judge,
+    Regions,
+    hide,
+    is_plausible,
+    search,
+    share_of,
+    shows_movement,
+)
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 from recon_cli.workspace.summaries import TrialDecision
@@ -128,6 +139,8 @@ class Needs:
 
     config: RunConfig  # with every optional part on or off
     decisions: tuple[TrialDecision, ...]  # why, one for each part that was left automatic
+    # [h, w] where each training and each validation view shows what moves; None: nothing does
+    moving: Regions | None = None
 
     @property
     def seconds(self) -> float:
@@ -179,7 +192,10 @@ def examine(scene: TrialScene) -> Needs:
     settle("depth", "on" if scene.task.has_depth else None, scene.task.depth_refused)
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
-    return Needs(config, tuple(decisions))
+    # what is compared with tables of the literature sees what they saw
+    off = config.moving == "off" or (config.moving == "auto" and config.densify == "reference")
+    moving = None if off else bench.find_moving(config, decisions)
+    return Needs(config, tuple(decisions), moving)
 
 
 def _word(part: str, *, on: bool) -> str:
@@ -205,6 +221,7 @@ class _Bench:
         self.drift = (estimate_gains(task.train, scene.points) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))
         self._scores: dict[tuple[object, ...], list[float]] = {}
+        self._models: dict[tuple[object, ...], Splats] = {}
 
     def try_part(self, part: str, config: RunConfig, value: str) -> TrialDecision:
         """Returns whether a part pays on top of those that are on already."""
@@ -242,6 +259,63 @@ class _Bench:
                 return low
         return config.sh_degree
 
+    def find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
+        """Returns where each training and validation view shows what moves; None: no masks pay."""
+        start, task = time.perf_counter(), self._scene.task
+        if split(len(task.train), len(task.validation)) is None:
+            decisions.append(skip_trial("moving", "there are too few views to tell"))
+            return None
+        views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
+        self._run(config)
+        model = self._models[_key(config)]
+        if config.moving == "auto" and not shows_movement(model, views, judge):
+            decisions.append(replace(skip_trial("moving", "no views contradict the others"),
+                                     seconds=time.perf_counter() - start))
+            return None
+        regions = search(model, views, range(len(task.train)), judge, partial(self._probe, config))
+        if not any(region.any() for region in regions):
+            decision = skip_trial("moving", "what contradicted other views was not found again")
+        elif not is_plausible(regions):
+            decision = skip_trial("moving", f"{share_of(regions):.0%} of the pixels contradict "
+                                  "other views, too many to be people or things")
+        elif config.moving == "on":
+            decision = replace(skip_trial("moving", "asked for"), on=True)
+        else:
+            decision = self._try_masks(config, model, hide(views, regions))
+        decisions.append(replace(decision, seconds=time.perf_counter() - start))
+        return regions if decision.on else None
+
+    def _try_masks(
+        self, config: RunConfig, model: Splats, masked: list[TrainView]
+    ) -> TrialDecision:
+        """Returns whether masks pay in what they leave of the views that are scored.
+
+        They need not gain in these few steps, in which few Gaussians follow what moves.
+        """
+        rows, _ = self._views()
+        task = self._scene.task
+        chosen = split(len(task.train), len(task.validation))
+        assert chosen is not None
+        offset = 0 if chosen.own else len(task.train)
+        held_out = [view for view in (masked[offset + row] for row in chosen.held_out)
+                    if leaves_enough(reduce_view(view, LEVEL).mask)]
+        if len(held_out) < 2:
+            return skip_trial("moving", "too little of the views to score is left")
+        config = self._short(config)
+
+        def score(splats: Splats) -> list[float]:
+            return self._score(splats, held_out, config)
+
+        return decide("moving", (
+            lambda: score(model), lambda: score(self._fit(config, [masked[row] for row in rows]))),
+            unless_worse=True)
+
+    def _probe(self, config: RunConfig, views: Sequence[TrainView], side: int) -> Splats:
+        """Returns a model of views reduced to `side` pixels, and of as many more Gaussians."""
+        finer = side / SIDE
+        largest = max(max(view.camera.width, view.camera.height) for view in views)
+        return self._fit(self._short(config, finer), views, factor=max(1.0, largest / side))
+
     def _telling(self, part: str) -> list[int]:
         """Returns which held-out views can tell whether a part pays; the others only add noise."""
         _, views = self._views()
@@ -259,33 +333,62 @@ class _Bench:
 
     def _run(self, config: RunConfig) -> list[float]:
         """Returns the corrected PSNR in dB of each held-out view after a short run."""
-        for part in PARTS:
-            if getattr(config, part) == "auto":
-                config = _with(config, part, _word(part, on=False))
-        key = (config.sh_degree, *(getattr(config, part) for part in PARTS))
+        key = _key(config)
         if key not in self._scores:
-            self._scores[key] = self._train(replace(
-                config, iterations=_STEPS, max_gaussians=min(config.max_gaussians, _CAP),
-                early_stop=False, batch_views=1))
+            self._models[key], self._scores[key] = self._train(self._short(config))
         return self._scores[key]
 
-    def _train(self, config: RunConfig) -> list[float]:
-        scene, task = self._scene, self._scene.task
-        train = task.train
+    def _short(self, config: RunConfig, finer: float = 1.0) -> RunConfig:
+        """Returns the options of a short run, of more steps and Gaussians by a factor."""
+        return replace(
+            _settled(config), iterations=round(finer * _STEPS),
+            max_gaussians=min(config.max_gaussians, round(finer * _CAP)), early_stop=False,
+            batch_views=1)
+
+    def _train(self, config: RunConfig) -> tuple[Splats, list[float]]:
+        scene, train = self._scene, self._scene.task.train
         if scene.twins is not None and config.images == "denoised":
             train = [replace(twin, depth=view.depth)
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
+        splats = self._fit(config, [train[i] for i in rows])
+        return splats, self._score(splats, held_out, config)
+
+    def _score(
+        self, splats: Splats, views: Sequence[TrainView], config: RunConfig
+    ) -> list[float]:
+        backend = self._scene.task.backend
+        return [mean_psnr(splats, [reduce_view(view, LEVEL)], config.sh_degree, backend,
+                          corrected=True) for view in views]
+
+    def _fit(
+        self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL
+    ) -> Splats:
+        """Returns the Gaussians of a short run on views reduced by a factor."""
+        scene, task = self._scene, self._scene.task
         # Far content seemed worth up to 1 dB less where a run so short replaced Gaussians, too; in
         # runs of full length it is worth as much as without (tests/bench/notes/training.md).
         recipe = Schedule(config).recipe
         recipe = dataclasses.replace(recipe, levels=(), replaced_at_once=0.0,
                                      means_rate=_FURTHER * recipe.means_rate)
         schedule = Schedule(config, recipe)
-        small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
+        small = Task([reduce_view(view, factor) for view in views], [], schedule, task.extent,
                      task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
-        fit(state, small, _STEPS)
-        return [mean_psnr(state.splats, [reduce_view(view, LEVEL)], config.sh_degree, task.backend,
-                          corrected=True) for view in held_out]
+        fit(state, small, config.iterations)
+        return state.splats
+
+
+def _settled(config: RunConfig) -> RunConfig:
+    """Returns the options with every part off that is not decided yet."""
+    for part in PARTS:
+        if getattr(config, part) == "auto":
+            config = _with(config, part, _word(part, on=False))
+    return config
+
+
+def _key(config: RunConfig) -> tuple[object, ...]:
+    """Returns what tells the short runs of a scene apart."""
+    config = _settled(config)
+    return config.sh_degree, *(getattr(config, part) for part in PARTS)

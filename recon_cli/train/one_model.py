@@ -13,6 +13,7 @@ from recon_cli.scene.scene import Scene
 from recon_cli.splats.ply import write_ply
 from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.finished_model import FinishedModel
+from recon_cli.train.moving_masks import EditedMasks, read_summary
 from recon_cli.train.plan import first_or_saved, plan_task
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
@@ -24,13 +25,14 @@ from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
 
 def fit_scene(
     config: TrainConfig, scene: Scene, out: Path, ctx: StageContext,
-    model: FinishedModel | None = None,
+    model: FinishedModel | None = None, edited: EditedMasks | None = None,
 ) -> TrainSummary:
     """Fits Gaussians to the views of a scene and returns how far it came.
 
-    `model` is the one that the run continues, None for a run that begins anew.
+    `model` is the one that the run continues, None for a run that begins anew; `edited` are a
+    user's masks of what moves.
     """
-    task = plan_task(config, scene, out, ctx, model)
+    task = plan_task(config, scene, out, ctx, model, edited)
     if model is not None and not (out / CHECKPOINT).exists():
         model.write_inherited_files(task.schedule, out, ctx)
     state = first_or_saved(task, scene, out / CHECKPOINT, model)
@@ -59,4 +61,5 @@ def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> T
         validation_psnr_db=last.validation_psnr_db, train_seconds=last.seconds,
         parts=model_parts(config), skipped_steps=state.skipped, estimated_seconds=plan.seconds,
         calibration_seconds=round(plan.cost["seconds"], 3),
-        cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0)
+        cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,
+        moving=read_summary(out))

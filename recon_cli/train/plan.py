@@ -27,6 +27,7 @@ from recon_cli.train.cost import CostModel, calibrate
 from recon_cli.train.feature_trials import Needs, TrialScene, examine, model_parts
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.initialize import first_state, restore_state, surfaces_of
+from recon_cli.train.moving_masks import EditedMasks, copy_masks, with_masks, write_masks
 from recon_cli.train.schedule import RECIPES, Schedule, make_schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
@@ -212,12 +213,16 @@ def _largest(fits: Callable[[int], bool], low: int, high: int) -> int:
 
 def plan_task(
     config: TrainConfig, scene: Scene, out: Path, ctx: StageContext,
-    model: FinishedModel | None = None,
+    model: FinishedModel | None = None, edited: EditedMasks | None = None,
 ) -> Task:
     """Returns the task of a run by its plan: a recorded one, or one that is made and recorded.
 
-    `model` is the one that the run continues, with its parts.
+    `model` is the one that the run continues, with its parts; `edited` are a user's masks.
     """
+    if model is not None:
+        copy_masks(model.folder, out)
+    if model is not None or (out / TrainPlan.FILE).exists():
+        scene = with_masks(scene, out)
     if (out / TrainPlan.FILE).exists():
         recorded = dataclasses.replace(read_config(out), checkpoint_every=config.checkpoint_every)
         schedule = make_schedule(recorded, TrainPlan.read(out).continues_at)
@@ -232,8 +237,10 @@ def plan_task(
     task = load_task(scene, first, ctx)
     needs = Needs(first, model.decisions) if model is not None else choose_parts(
         task, scene, ctx, harmonics=config.sh_degree is None)
-    if needs.config.images == "denoised" and first.images != "denoised":
-        task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
+    masked = model is None and write_masks(out, scene, needs.moving, edited or EditedMasks())
+    if masked or (needs.config.images == "denoised" and first.images != "denoised"):
+        scene = with_masks(scene, out)
+        task = load_task(scene, dataclasses.replace(first, images=needs.config.images), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = Facts(count_detail(task.train), len(task.train), len(scene.points), fit_memory)
     spent = 0.0 if model is not None else needs.seconds + _search_surfaces(

@@ -25,6 +25,7 @@ from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import make_finished_state, restore_state
+from recon_cli.train.moving_masks import with_masks
 from recon_cli.train.prune_loop import PruneRun, remaining, rounds_within
 from recon_cli.train.runner import LOG, Segment, TrainLog, run_fit, seconds_at
 from recon_cli.train.schedule import RecoverySchedule
@@ -100,7 +101,7 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
                    "model is pruned.")
         config = dataclasses.replace(config, at="end")
     train_config = read_config(train)
-    scene = load_scene(inputs.folders, validation=train_config.validation)
+    scene = with_masks(load_scene(inputs.folders, validation=train_config.validation), train)
     task = load_task(scene, train_config, ctx)
     path = train / "mid.safetensors" if config.at == "mid" else final
 

@@ -29,6 +29,7 @@ from recon_cli.scene.train_view import leaves_enough
 from recon_cli.splats.html import find_title
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.registry import read_splats
+from recon_cli.train.moving_masks import read_summary
 from recon_cli.viewer.gaussians import PackedSplats, pack_splats
 from recon_cli.viewer.keyframes import PathFolder
 
@@ -81,6 +82,7 @@ class ViewerContent:
     title: str  # of the page
     paths: PathFolder  # where camera paths are saved
     metres: bool = False  # one world unit is a metre
+    masked: str = ""  # what training masked because it moves, a sentence; empty for nothing
 
 
 def load_workspace(job: Job, model: str) -> ViewerContent:
@@ -104,7 +106,16 @@ def load_workspace(job: Job, model: str) -> ViewerContent:
         models, views, trained.up(), browser_camera(first, distance, _far_plane(models)), distance,
         trained.max_size, _find_title(job), PathFolder(
             job.workspace.root, job.workspace.root, fit_size(first.width, first.height, TOUR_SIZE)),
-        trained.metres)
+        trained.metres, _describe_masked(job))
+
+
+def _describe_masked(job: Job) -> str:
+    """Returns what the training of a workspace masked, a sentence; empty for nothing."""
+    summary = read_summary(job.workspace.folder("train"))
+    if summary is None:
+        return ""
+    return (f"{summary.share:.1%} of the pixels of {len(summary.shares)} of {summary.views} views "
+            "were masked in training, as they move.")
 
 
 def _find_title(job: Job) -> str:

@@ -103,6 +103,8 @@ class Session:
     def _add_panel(self) -> None:
         gui = self._client.gui
         self._count = gui.add_markdown(self._count_text())
+        if self._content.masked:
+            gui.add_markdown(self._content.masked)
         models = list(self._content.models)
         if len(models) > 1:
             labels = {MODEL_LABELS.get(name, name): name for name in models}

@@ -201,13 +201,19 @@ def differences(
 
 
 def find_changed_outputs(
-    folder: Path, finished: Manifest, volatile: Sequence[str], removable: Sequence[str] = ()
+    folder: Path, finished: Manifest, volatile: Sequence[str], removable: Sequence[str] = (),
+    edits: str = "",
 ) -> list[str]:
     """Returns in words which outputs are no longer what the stage wrote.
 
-    Names that match `volatile` may differ, those that match `removable` may be missing.
+    Names that match `volatile` may differ, those that match `removable` may be missing; a file that
+    was added to the folder `edits` counts.
     """
     changes = []
+    if edits:
+        names = sorted(path.name for path in (folder / edits).glob("*") if path.is_file())
+        changes = [f"{edits}/{name} was added by hand" for name in names
+                   if f"{edits}/{name}" not in finished.outputs]
     for name, known in finished.outputs.items():
         path = folder / name
         if matches(name, volatile) or (

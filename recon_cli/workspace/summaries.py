@@ -267,6 +267,22 @@ class MergeSummary(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MovingSummary(JsonRecord):
+    """What was masked in training because it moves, in masks.json beside the masks."""
+
+    FILE: typing.ClassVar[str] = "masks.json"
+
+    shares: Mapping[str, float]  # of the pixels, by the names of the views that are masked
+    by_hand: tuple[str, ...] = ()  # names of views whose mask a user has made or changed
+    views: int  # that training reads, masked or not
+
+    @property
+    def share(self) -> float:
+        """Share of all pixels that training reads."""
+        return sum(self.shares.values()) / max(1, self.views)
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainSummary(JsonRecord):
     """How a training ended; one in blocks adds up steps and times of all of them."""
 
@@ -293,6 +309,7 @@ class TrainSummary(JsonRecord):
     cuda_peak_bytes: int
     blocks: int | None = None  # that were trained apart; None for one model
     merge: MergeSummary | None = None  # of these
+    moving: MovingSummary | None = None  # None where nothing is masked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,9 @@ def reasons(needs):
 def test_a_plain_scene_needs_nothing_and_pays_nothing():
     needs = examine(scene())
     assert needs.config.far == needs.config.exposure == "off"
-    assert needs.seconds == 0
+    tried = [one.name for one in needs.decisions if one.seconds]
+    assert tried == ["moving"]  # which takes a look
+    assert needs.moving is None
     assert "cover all" in reasons(needs)["far"]
     assert "differs by" in reasons(needs)["exposure"]
 
@@ -44,7 +46,7 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 
 def test_what_the_options_say_is_not_tried():
-    config = replace(CONFIG, far="off", stereo="on", exposure="on")
+    config = replace(CONFIG, far="off", stereo="on", exposure="on", moving="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config
@@ -59,7 +61,7 @@ def test_too_few_views_switch_nothing_on():
 def test_matt_colours_get_no_harmonics():
     needs = examine(replace(scene(), harmonics=True))
     assert needs.config.sh_degree == 0
-    assert [one.name for one in needs.decisions][-1] == "harmonics above degree 0"
+    assert [one.name for one in needs.decisions][-2:] == ["harmonics above degree 0", "moving"]
 
 
 def test_the_same_scene_gets_the_same_answer():

@@ -1,0 +1,316 @@
+"""Finds what moves: regions of a view that contradict what other views show of the same surfaces.
+
+A person who walks through is in few views, and behind him the others see the room. Where a model of
+the room explains the others but not this view, this view shows something else. Errors of the model
+itself do not count: it errs alike in all views of a surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.evaluation.reference_views import render_view
+from recon_cli.io.images import reduce_view
+from recon_cli.render.surface_depth import render_surface
+from recon_cli.scene.camera import Camera
+from recon_cli.scene.splats import Splats
+from recon_cli.scene.train_view import TrainView
+from recon_cli.stereo.depths import places
+
+SIDE = 150  # pixels of the longer side of the views that are compared
+_OTHERS = 14  # views that each is compared with, spread over all that show the same
+_LEAST = 3  # of them must see a surface to contradict a view
+_SHARED = 0.15  # of a view's surface that another must see to be one of them
+_GRID = 6  # pixels from one to the next that are looked at to tell that
+_TOLERANCE = 0.06  # of a depth, within which two views see the same surface
+_SMOOTH = 1.0  # pixels, standard deviation: small errors of poses do not count
+_DARK = 0.06  # brightness from which a pixel tells the gain of a view
+
+Error = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedView:
+    """A view beside the render of a model."""
+
+    camera: Camera
+    error: Error  # [H, W, 3] photo minus render after the best gain, smoothed; 0 where ignored
+    depth: NDArray[np.float32]  # [H, W] of the model's surface, world units; 0 where there is none
+    counts: NDArray[np.bool_]  # [H, W] False where a mask ignores the photo
+
+
+def compare_view(
+    splats: Splats, view: TrainView, sh_degree: int, backend: str, *, side: int = SIDE
+) -> ComparedView:
+    """Returns a view, reduced to `side` pixels, beside its render."""
+    small = reduce_view(view, max(1.0, max(view.camera.width, view.camera.height) / side))
+    rgb = render_view(splats, small.camera, sh_degree, backend).rgb.cpu().numpy()
+    depth = render_surface(splats, small.camera, backend=backend).depth.cpu().numpy()
+    photo = (small.image / 255).astype(np.float32)
+    counts = np.ones(photo.shape[:2], np.bool_) if small.mask is None else small.mask
+    error = (photo - rgb * _median_gain(rgb, photo, counts)) * counts[..., None]
+    return ComparedView(
+        small.camera, _smooth(np.asarray(error, np.float32)), np.asarray(depth, np.float32), counts)
+
+
+def _median_gain(
+    rgb: NDArray[np.float32], photo: NDArray[np.float32], counts: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Returns the gain [3] of a view that a third of other content does not change."""
+    tells = counts & (rgb.min(axis=2) > _DARK) & (photo.min(axis=2) > _DARK)
+    if not tells.any():
+        return np.ones(3, np.float32)
+    return np.asarray(np.median(photo[tells] / rgb[tells], axis=0), np.float32)
+
+
+def _smooth(error: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(error, (0, 0), _SMOOTH), np.float32)
+
+
+def find_others(
+    own: ComparedView, views: Sequence[ComparedView], most: int = _OTHERS
+) -> NDArray[np.int64]:
+    """Returns which of `views` see the surface of another view, spread evenly over the capture."""
+    pixels = _grid(own.depth)
+    if not len(pixels):
+        return np.empty(0, np.int64)
+    where = places(own.camera, own.depth, pixels)
+    shares = np.array([0.0 if other is own else float(np.mean(_sees(other, where)))
+                       for other in views])
+    good = np.flatnonzero(shares >= _SHARED)
+    spread = np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))
+    return np.asarray(good[spread], np.int64)
+
+
+def count_witnesses(own: ComparedView, views: Sequence[ComparedView]) -> NDArray[np.int64]:
+    """Returns how many of `views` see the surface in each pixel [H, W] of another view."""
+    pixels = np.flatnonzero(own.depth.reshape(-1) > 0)
+    where = places(own.camera, own.depth, pixels)
+    count = np.zeros(own.depth.size, np.int64)
+    for other in views:
+        count[pixels] += _sees(other, where)
+    return count.reshape(own.depth.shape)
+
+
+def _grid(depth: NDArray[np.float32]) -> NDArray[np.int64]:
+    height, width = depth.shape
+    rows, columns = np.mgrid[_GRID // 2:height:_GRID, _GRID // 2:width:_GRID]
+    pixels = (rows * width + columns).reshape(-1)
+    return np.asarray(pixels[depth.reshape(-1)[pixels] > 0], np.int64)
+
+
+def _project(
+    camera: Camera, where: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Returns column and line, from the centre of the first pixel, and depth of places [N, 3]."""
+    x, y, z = camera.viewmat[:3, :3] @ where.T + camera.viewmat[:3, 3:]
+    safe = np.where(z > 0, z, np.inf)
+    return (np.asarray(camera.fx * x / safe + camera.cx - 0.5, np.float32),
+            np.asarray(camera.fy * y / safe + camera.cy - 0.5, np.float32),
+            np.asarray(z, np.float32))
+
+
+def _sees(view: ComparedView, where: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Returns which places [N, 3] are on the surface that a view sees, and count there."""
+    column, line, depth = _project(view.camera, where)
+    u, v = (np.rint(np.clip(item, -2, 1 << 20)).astype(np.int64) for item in (column, line))
+    inside = (depth > 0) & (u >= 0) & (v >= 0) & (
+        u < view.camera.width) & (v < view.camera.height)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    surface = view.depth[v, u]
+    return np.asarray(
+        inside & view.counts[v, u] & (np.abs(depth - surface) < _TOLERANCE * depth))
+
+
+@dataclass(frozen=True, eq=False)
+class Contradiction:
+    """How much a view differs from what others show of the same surfaces."""
+
+    # [H, W] error beyond the others' median error, 0 to 1; where too few see the surface, all of it
+    amount: NDArray[np.float32]
+    spread: NDArray[np.float32]  # [H, W] how far the others differ from their median
+    seen: NDArray[np.int64]  # [H, W] others that see the surface
+
+
+def contradict(
+    views: Sequence[ComparedView], own: ComparedView, others: NDArray[np.int64]
+) -> Contradiction:
+    """Returns how `own` contradicts those of `views` that `others` names."""
+    height, width = own.depth.shape
+    pixels = np.flatnonzero(own.depth.reshape(-1) > 0)
+    amount, spread = _length(own.error).reshape(-1), np.zeros(height * width, np.float32)
+    seen = np.zeros(height * width, np.int64)
+    if not len(pixels) or not len(others):
+        return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
+                             seen.reshape(height, width))
+    where = places(own.camera, own.depth, pixels)
+    errors = np.full((len(others), len(pixels), 3), np.inf, np.float32)
+    for row, index in zip(errors, others, strict=True):
+        other = views[index]
+        visible = _sees(other, where)
+        column, line, _ = _project(other.camera, where[visible])
+        row[visible] = _sample(other.error, column, line)
+    count = np.isfinite(errors[..., 0]).sum(axis=0)
+    told = count >= _LEAST
+    errors, rows = errors[:, told], (count[told] - 1) // 2
+    middle = _median(errors, rows)
+    mine = own.error.reshape(-1, 3)[pixels[told]]
+    amount[pixels[told]] = np.sqrt(np.square(mine - middle).mean(axis=1))
+    spread[pixels[told]] = _median(np.abs(errors - middle).mean(axis=2), rows)
+    seen[pixels] = count
+    amount[~own.counts.reshape(-1)] = 0
+    return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
+                         seen.reshape(height, width))
+
+
+def _median(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Returns the lower median [N, ...] of values [K, N, ...]; what is missing is infinite."""
+    ranked = np.sort(values, axis=0)
+    return np.asarray(ranked[rows, np.arange(values.shape[1])], np.float32)
+
+
+def _sample(
+    image: NDArray[np.float32], column: NDArray[np.float32], line: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Returns the values [N, 3] of an image between its pixels."""
+    if not len(column):
+        return np.empty((0, 3), np.float32)
+    across = 1 << 14  # OpenCV takes no longer lines
+    rows = -(-len(column) // across)
+    padded = np.zeros((2, rows * across), np.float32)
+    padded[0, :len(column)], padded[1, :len(column)] = column, line
+    u, v = padded.reshape(2, rows, across)
+    values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values.reshape(-1, 3)[:len(column)], np.float32)
+
+
+# A region begins where the contradiction is beyond all noise and ends where it is no more. Noise is
+# the capture's own: the median over all pixels of all views.
+_STRONG, _WEAK = 8.0, 3.0  # times the noise
+# Of the brightness. A shadow begins faintly: what is fainter than _TELLS only adds to a region.
+_LEAST_STRONG, _TELLS, _LEAST_WEAK = 0.10, 0.04, 0.025
+_BEYOND = 3.0  # times the spread of the others
+_AREA = 0.004  # of a view's pixels; smaller regions are errors of the model
+_THICK = 2.0  # pixels from the middle of a region to its border; edges of things are thin
+_MARGIN = 2  # pixels that a region is widened by
+# Half of a region must be this many times beyond the spread of the others, who must agree. After a
+# short run it was 15 and more for 40 made people and 30 for a monitor that shows something else
+# (desk_monitors), up to 10.8 for gloss, windows, vignettes and poor surfaces in nine captures.
+_AGREED, _SPREAD_FLOOR = 12.0, 0.001
+# A tenth of it must stand out clearly: shadows of whoever films stay below .21 (fox), people had
+# more than .3. And half of it must be seen by so many others.
+_CLEAR, _WITNESSES = 0.22, 4
+# Share of the views of a surface that may show something else there. Where more do, as at a window
+# or a mirror, it is the model that is wrong.
+_FEW = 0.5
+TOO_NOISY = 0.03  # noise from which a model is too poor to tell: two walks of three such had errors
+
+
+def noise_level(views: Sequence[ComparedView]) -> float:
+    """Returns the error that half of the pixels of a capture stay below, 0 to 1."""
+    values = np.concatenate([_length(view.error)[view.counts] for view in views])
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def _length(error: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(np.sqrt(np.square(error).mean(axis=-1)), np.float32)
+
+
+def _may_move(view: ComparedView, noise: float) -> bool:
+    """Returns whether a view differs enough from its render to be compared with others at all."""
+    strong = _length(view.error) > max(_LEAST_STRONG, _STRONG * noise)
+    return bool(_morphed(strong, cv2.MORPH_OPEN, 1).mean() >= _AREA / 4)
+
+
+def find_regions(found: Contradiction, noise: float) -> NDArray[np.bool_]:
+    """Returns where a view shows what moves, [H, W]: connected, large and contradicted."""
+    beyond = found.amount - _BEYOND * found.spread
+    strong = beyond > max(_LEAST_STRONG, _STRONG * noise)
+    strong = _morphed(strong, cv2.MORPH_OPEN, 1)
+    weak = _morphed(strong | (beyond > max(_LEAST_WEAK, _WEAK * noise)), cv2.MORPH_CLOSE, 2)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        weak.astype(np.uint8), connectivity=4)
+    inside = cv2.distanceTransform(weak.astype(np.uint8), cv2.DIST_L2, 3)
+    ratio = found.amount / (found.spread + _SPREAD_FLOOR)
+    result = np.zeros(weak.shape, np.bool_)
+    for label in range(1, count):
+        region = labels == label
+        # what others do not see belongs to a region that they contradict, and makes none
+        told = region & (found.seen >= _LEAST) & (found.amount >= _TELLS)
+        if (stats[label, cv2.CC_STAT_AREA] >= _AREA * region.size
+                and np.count_nonzero(told & strong) >= _AREA * region.size / 4
+                and inside[region].max() >= _THICK
+                and np.median(ratio[told]) >= _AGREED
+                and np.quantile(found.amount[told], 0.9) >= _CLEAR
+                and np.median(found.seen[told]) >= _WITNESSES):
+            result |= region
+    return np.asarray(cv2.dilate(result.astype(np.uint8), _disc(_MARGIN)) > 0)
+
+
+def drop_common(
+    views: Sequence[ComparedView], others: Mapping[int, NDArray[np.int64]],
+    regions: Sequence[NDArray[np.bool_]],
+) -> list[NDArray[np.bool_]]:
+    """Returns the regions of each view without those that most views of the same surface have."""
+    kept = []
+    for own, (view, region) in enumerate(zip(views, regions, strict=True)):
+        result = region.copy()
+        count, labels = cv2.connectedComponents(region.astype(np.uint8), connectivity=4)
+        for label in range(1, count):
+            part = labels == label
+            if _common(views, view, others[own], regions, part) > _FEW:
+                result[part] = False
+        kept.append(result)
+    return kept
+
+
+def _common(
+    views: Sequence[ComparedView], own: ComparedView, others: NDArray[np.int64],
+    regions: Sequence[NDArray[np.bool_]], part: NDArray[np.bool_],
+) -> float:
+    """Returns in what share of the other views of its surface a part of a view is in a region."""
+    pixels = np.flatnonzero(part.reshape(-1) & (own.depth.reshape(-1) > 0))
+    where = places(own.camera, own.depth, pixels)
+    seen = inside = 0
+    for index in others:
+        other = views[index]
+        visible = where[_sees(other, where)]
+        column, line, _ = _project(other.camera, visible)
+        seen += len(visible)
+        inside += int(regions[index][np.rint(line).astype(int), np.rint(column).astype(int)].sum())
+    return inside / max(1, seen)
+
+
+def _morphed(mask: NDArray[np.bool_], how: int, radius: int) -> NDArray[np.bool_]:
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), how, _disc(radius)) > 0)
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    size = 2 * radius + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
+
+
+def find_moving(
+    views: Sequence[ComparedView], witnesses: Sequence[ComparedView] | None = None
+) -> list[NDArray[np.bool_]]:
+    """Returns where each view shows what moves, [H, W]: it contradicts `witnesses`, or the others.
+
+    Nowhere where the model is too poor to tell.
+    """
+    others = views if witnesses is None else witnesses
+    regions = [np.zeros(view.depth.shape, np.bool_) for view in views]
+    noise = noise_level(others)
+    if noise > TOO_NOISY:
+        return regions
+    chosen = [row for row, view in enumerate(views) if _may_move(view, noise)]
+    partners = {row: find_others(views[row], others) for row in chosen}
+    for row in chosen:
+        regions[row] = find_regions(contradict(others, views[row], partners[row]), noise)
+    if witnesses is not None:
+        return regions
+    return drop_common(views, partners, regions)

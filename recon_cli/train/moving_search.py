@@ -1,0 +1,122 @@
+"""Searches the regions of views that move, by short runs before the training.
+
+The first look is at a model that a trial has trained anyway; in most captures nothing in it moves,
+and that is all. Otherwise the masks are found anew twice: by a model trained without the regions of
+the first look, and by one of finer images without those of the second.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.io.images import fill_masked, reduce_view
+from recon_cli.io.views import evenly_spread
+from recon_cli.scene.splats import Splats
+from recon_cli.scene.train_view import TrainView, leaves_enough
+from recon_cli.train.moving import SIDE, compare_view, find_moving
+
+FINER = 2  # times as large are the images of the last round as those of the first
+_FIRST_LOOK = 60  # views, evenly spread
+_SIGN = 2  # of them that must show what moves: one alone may have a pose of its own
+_MOST = 0.25  # of all pixels; more are not people who walk through, but a model that is wrong
+
+Regions = list[NDArray[np.bool_]]
+# Trains on views, reduced to this side, and returns the model
+Probe = Callable[[Sequence[TrainView], int], Splats]
+
+logger = logging.getLogger("recon")
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """How views are compared with a model."""
+
+    sh_degree: int
+    backend: str
+
+    def regions(self, splats: Splats, views: Sequence[TrainView], side: int = SIDE) -> Regions:
+        """Returns where each view shows what moves, at its size reduced to `side` pixels."""
+        return find_moving([
+            compare_view(splats, view, self.sh_degree, self.backend, side=side)
+            for view in views])
+
+
+def shows_movement(splats: Splats, views: Sequence[TrainView], judge: Judge) -> bool:
+    """Returns whether some views, evenly spread, show something that moves."""
+    some = evenly_spread(views, _FIRST_LOOK)
+    return int(sum(region.any() for region in judge.regions(splats, some))) >= _SIGN
+
+
+def search(
+    splats: Splats, views: Sequence[TrainView], training: Sequence[int], judge: Judge, probe: Probe
+) -> Regions:
+    """Returns where each view shows what moves, by models that get better.
+
+    Args:
+        splats: the first model.
+        views: all that are compared; those in the rows `training` are trained on.
+        training: see there.
+        judge: how they are compared.
+        probe: trains on views without their regions.
+    """
+    views = [reduce_view(view, max(1.0, max(view.camera.width, view.camera.height)
+                                   / (FINER * SIDE))) for view in views]
+    regions = judge.regions(splats, views)
+    for side in (SIDE, FINER * SIDE):
+        if not any(region.any() for region in regions):
+            break
+        masked = hide(views, regions)
+        better = probe([masked[row] for row in training if leaves_enough(masked[row].mask)], side)
+        # the views as they are: who is found no more is trained on again
+        regions = judge.regions(better, views, side)
+        logger.info("moving: %.1f%% of the pixels of %d of %d views", 100 * share_of(regions),
+                    sum(region.any() for region in regions), len(views))
+    return regions
+
+
+def find_in_held_out(
+    splats: Splats, held_out: Sequence[TrainView], training: Sequence[TrainView], judge: Judge
+) -> Regions:
+    """Returns where held-out views contradict those that a model was trained on, [H, W] each."""
+    compared, witnesses = ([
+        compare_view(splats, view, judge.sh_degree, judge.backend, side=FINER * SIDE)
+        for view in views] for views in (held_out, evenly_spread(training, _FIRST_LOOK)))
+    return [enlarge(region, view.camera.width, view.camera.height)
+            for region, view in zip(find_moving(compared, witnesses), held_out, strict=True)]
+
+
+def share_of(regions: Sequence[NDArray[np.bool_]]) -> float:
+    """Returns the mean share of the pixels of a view."""
+    return float(np.mean([region.mean() for region in regions])) if regions else 0.0
+
+
+def is_plausible(regions: Sequence[NDArray[np.bool_]]) -> bool:
+    """Returns whether the regions are few enough to be people and things that were moved."""
+    return bool(share_of(regions) <= _MOST)
+
+
+def hide(views: Sequence[TrainView], regions: Sequence[NDArray[np.bool_]]) -> list[TrainView]:
+    """Returns the views without their regions [h, w], which may be of another size."""
+    hidden = []
+    for view, region in zip(views, regions, strict=True):
+        if region.any():
+            counts = ~enlarge(region, view.camera.width, view.camera.height)
+            if view.mask is not None:
+                counts &= view.mask
+            image = fill_masked(view.image, counts)
+            hidden.append(replace(view, stored=image, mask=counts, file=None))
+        else:
+            hidden.append(view)
+    return hidden
+
+
+def enlarge(region: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+    """Returns a region in another size, with a smooth border."""
+    large = cv2.resize(region.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large > 0.5)
