@@ -39,7 +39,7 @@ class Mesh:
         return np.asarray(self.inferred[self.faces].all(axis=1))
 
     def parts(self) -> Iterator[tuple[str, Mesh]]:
-        """Yields the surface, and what is inferred, each as a mesh, with its name; none is empty."""
+        """Yields the surface and what is inferred, each as a mesh with its name; none is empty."""
         inferred = self.inferred_faces
         if not inferred.any():
             yield "surface", self
@@ -53,9 +53,9 @@ class Mesh:
                 self.vertices[rows], faces.reshape(-1, 3).astype(np.int64), self.colors[rows],
                 np.full(len(rows), name == "inferred"), texture)
 
-    def area(self) -> float:
-        """Returns the area of all triangles."""
-        corners = self.vertices[self.faces]
+    def area(self, chosen: NDArray[np.bool_] | None = None) -> float:
+        """Returns the area of the triangles, or of some of them [F]."""
+        corners = self.vertices[self.faces if chosen is None else self.faces[chosen]]
         return float(np.linalg.norm(np.cross(
             corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2)
 

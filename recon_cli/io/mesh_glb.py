@@ -122,7 +122,8 @@ def read_glb(path: Path) -> Mesh:
         [image] = tree["images"]
         view = tree["bufferViews"][image["bufferView"]]
         first = start + view.get("byteOffset", 0)
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8, view["byteLength"], first), 1)
+        pixels: NDArray[np.uint8] = np.asarray(cv2.imdecode(
+            np.frombuffer(data, np.uint8, view["byteLength"], first), cv2.IMREAD_COLOR), np.uint8)
         kind = next(kind for kind, mime in _MIMES.items() if mime == image["mimeType"])
         texture = Texture(np.ascontiguousarray(pixels[:, :, ::-1]), found[
             "TEXCOORD_0"].astype(np.float64), kind)

@@ -1,4 +1,4 @@
-"""Triangle meshes with colours or a texture: .ply, .glb and .obj; their simplification by COLMAP."""
+"""Triangle meshes with colours or a texture: .ply, .glb, .obj; simplification by COLMAP; points."""
 
 from __future__ import annotations
 
