@@ -115,8 +115,8 @@ def _close(
         return None
     heights = _heights(grid, mesh.vertices[own])
     confirmed = np.isfinite(heights)
-    rim = _pad_close(confirmed | _edges(grid, plane, planes, mesh, voxel))
-    holes = binary_fill_holes(rim) & ~confirmed
+    meets, beyond = _edges(grid, plane, planes, mesh, voxel)
+    holes = binary_fill_holes(_pad_close(confirmed | meets)) & ~confirmed & ~beyond
     rows, columns = np.nonzero(holes)
     if not len(rows):
         return None
@@ -160,9 +160,10 @@ def _heights(grid: _Grid, corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _edges(
     grid: _Grid, plane: Plane, planes: Sequence[Plane], mesh: Mesh, voxel: float
-) -> NDArray[np.bool_]:
-    """Returns the cells [H, W] where the surface of other planes meets this one."""
-    meets = np.zeros(grid.shape, bool)
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Returns the cells where surface of other planes meets this one, and those behind it."""
+    meets, beyond = np.zeros((2, *grid.shape), bool)
+    shift = 0.5 * grid.cell
     for other in planes:
         if other is plane or abs(float(other.normal @ plane.normal)) > 1 - _LEAST_COSINE:
             continue
@@ -173,8 +174,13 @@ def _edges(
         local = local[np.abs(local[:, 2]) < _REACH * grid.cell]
         column, row = np.floor(local[:, :2]).astype(int).T
         inside = (row >= 0) & (column >= 0) & (row < grid.shape[0]) & (column < grid.shape[1])
-        meets[row[inside], column[inside]] = True
-    return np.asarray(cv2.dilate(meets.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+        touched = np.zeros(grid.shape, np.uint8)
+        touched[row[inside], column[inside]] = 1
+        rows, columns = np.nonzero(cv2.dilate(touched, np.ones((5, 5), np.uint8)))
+        behind = other.heights(grid.places(rows, columns, np.zeros(len(rows)), 0.5)) < -shift
+        meets[rows, columns] = True
+        beyond[rows[behind], columns[behind]] = True
+    return meets, beyond
 
 
 def _pad_close(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -92,7 +92,7 @@ def test_photos_of_other_exposure_leave_no_seam():
 
 def test_what_no_view_shows_keeps_the_colours_of_its_corners():
     back = wall()
-    behind = Mesh(back.vertices + (1.0, 0, 0), back.faces, np.full_like(back.colors, 200))
+    behind = Mesh(back.vertices + np.array([1.0, 0, 0]), back.faces, np.full_like(back.colors, 200))
     both = Mesh(np.concatenate([back.vertices, behind.vertices]),
                 np.concatenate([back.faces, behind.faces + len(back.vertices)]),
                 np.concatenate([back.colors, behind.colors]))
@@ -151,7 +151,7 @@ def test_threads_do_not_change_a_texture(monkeypatch, threads):
 
 
 def test_charts_keep_every_triangle_and_lie_apart():
-    sheets = [wall(6).vertices + (shift, 0, 0) for shift in (0.0, 0.3)]
+    sheets = [wall(6).vertices, wall(6).vertices + np.array([0.3, 0, 0])]
     faces = wall(6).faces
     # two sheets over each other that one row of triangles links: one piece must not cover itself
     link = np.array([[0, 49, 1], [1, 49, 50]])
