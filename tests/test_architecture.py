@@ -73,6 +73,7 @@ HOMES = {
     "trimesh": {"io"},
     "OpenEXR": {"io"},
     "lzfse": {"datasets"},
+    "xatlas": {"room"},
 }
 
 

@@ -11,6 +11,8 @@ from recon_cli.errors import ConfigError
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, OTHER_NAMES, describe_max_loss
 
+LEAST_TEXTURE = 64  # texels of a side
+
 
 def read_matrix(path: str) -> list[float]:
     """Returns the 16 numbers of a JSON file with 4 rows of 4 numbers, row by row."""
@@ -83,6 +85,15 @@ class ExportConfig(StageConfig):
         None, "Side of the voxels that a mesh is made in, in units of the exported scene.",
         minimum=0.0, per_file=True, expert=True,
         automatic="1/128 of the median depth; 2 cm in a room")
+    inferred: str = option(
+        "on", "Holes in walls, floor and ceiling that surface of the same plane surrounds: close "
+        "and mark them (on), also in blue (tint), or leave them open (off).",
+        choices=("on", "off", "tint"), per_file=True)
+    texture: int = option(
+        4096, "Side of the texture of a mesh (.glb, .obj) in texels; 0: a colour for each vertex.",
+        minimum=0, maximum=16384, per_file=True)
+    texture_format: str = option(
+        "png", "Format of the texture.", choices=("png", "jpg"), per_file=True, expert=True)
     spz_version: int = option(
         3, "Version of .spz: 3 is read by most programs; 2 by older ones, with coarser "
         "rotations; 4 uses zstd.", minimum=2, maximum=4, per_file=True, expert=True)
@@ -94,6 +105,8 @@ class ExportConfig(StageConfig):
             raise ConfigError(
                 "transform and up are given, but both turn the exported scene.",
                 hint="Leave out --transform or --up, here and in recon.toml.")
+        if 0 < self.texture < LEAST_TEXTURE:
+            raise self._error("texture", self.texture, f"0, or at least {LEAST_TEXTURE}")
         if self.crop and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise self._error("crop", list(self.crop), "a lowest and a highest corner")
         for name in self.formats:

@@ -15,9 +15,11 @@ from recon_cli.export.camera_files import write_cameras
 from recon_cli.export.reduce import lower_degrees
 from recon_cli.export.source import ExportSource
 from recon_cli.export.verify import file_size, measure_size, write_until_good
+from recon_cli.io.mesh_data import Mesh, joined
 from recon_cli.room.files import write_mesh_file, write_plan
 from recon_cli.room.measures import RoomFrame
 from recon_cli.room.mesh import MeshResult, build_mesh
+from recon_cli.room.texture import MOST_PIXELS, add_texture
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import write_points
@@ -66,7 +68,7 @@ class FormatWriter:
             case "cameras":
                 write_cameras(self._out, row, self._source)
             case "mesh":
-                write_mesh_file(self._out / row.file, self._mesh, self._source.frame.up)
+                return self._write_mesh(row)
             case "plan":
                 assert self._room_frame is not None
                 centers = [camera.center for _, camera in self._source.place(
@@ -96,6 +98,18 @@ class FormatWriter:
             file=row.file, bytes=size, smaller=round(ply_size / size, 3),
             psnr_change_db=round(gain, 4), psnr_db=round(self._psnr_db + gain, 4))
 
+    def _write_mesh(self, row: ExportFormat) -> ExportedFile:
+        mesh = self._textured if "texture" in row.options and self._config.texture else (
+            self._surface)
+        path = write_mesh_file(self._out / row.file, mesh, self._source.frame.up,
+                               tint=self._config.inferred == "tint")
+        share = (mesh.area(mesh.inferred_faces) / max(mesh.area(), 1e-30)
+                 if mesh.inferred is not None else None)
+        text = self._mesh.describe()
+        logger.info("%s: %s", row.file, text if not share else
+                    f"{text}; {share:.1%} of the area is inferred from planes")
+        return ExportedFile(file=row.file, bytes=path.stat().st_size, inferred_share=share)
+
     @cached_property
     def _psnr_db(self) -> float:
         """PSNR of the scene, which that of all files is compared with."""
@@ -108,4 +122,18 @@ class FormatWriter:
         return build_mesh(
             self._splats.map(lambda tensor: tensor.to(source.ctx.device)),
             source.load_training_with_depth(), source.points if measured else None, source.ctx,
-            max_triangles=self._config.max_triangles, voxel=self._config.voxel)
+            max_triangles=self._config.max_triangles, voxel=self._config.voxel,
+            infer=self._config.inferred != "off")
+
+    @cached_property
+    def _surface(self) -> Mesh:
+        """The mesh with what is inferred, if that is asked for."""
+        result = self._mesh
+        return result.mesh if result.inferred is None else joined(result.mesh, result.inferred)
+
+    @cached_property
+    def _textured(self) -> Mesh:
+        """The same with a texture."""
+        return add_texture(
+            self._surface, self._source.load_photos(MOST_PIXELS), self._config.texture,
+            self._config.texture_format, self._source.ctx.progress)

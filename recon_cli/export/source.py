@@ -90,6 +90,16 @@ class ExportSource:
     def _load_views(self) -> list[ReferenceView]:
         return load_views(self.scene.train, self._run_config, self.ctx)
 
+    def load_photos(self, most_pixels: int) -> list[TrainView]:
+        """Returns the training views as large as they are, or as `most_pixels` in all allow."""
+        views = self.scene.train
+        pixels = sum(view.camera.width * view.camera.height for view in views)
+        longest = max(max(view.camera.width, view.camera.height) for view in views)
+        size = max(int(longest * min(1.0, (most_pixels / pixels) ** 0.5)), 16)
+        config = dataclasses.replace(self._run_config, max_size=size)
+        return [dataclasses.replace(view, camera=self._similarity.camera(view.camera))
+                for view in load_views(views, config, self.ctx)]
+
     def place(self, views: Sequence[View]) -> list[tuple[str, Camera]]:
         """Returns views by name, with their cameras in the world of the files."""
         return [(view.name, self._similarity.camera(view.camera))

@@ -102,6 +102,14 @@ def to_uint8(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
+def encode_image(image: NDArray[np.uint8], kind: str) -> bytes:
+    """Returns an image [H, W, 3] as a file of a kind: png, or jpg of quality 95."""
+    encoded, data = cv2.imencode(f".{kind}", np.ascontiguousarray(image[:, :, ::-1]))
+    if not encoded:
+        raise ValueError(f"OpenCV cannot encode an image of shape {image.shape} as {kind}")
+    return data.tobytes()
+
+
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Writes [H, W, 3] RGB or [H, W] gray of 8 or 16 bits as PNG, atomically."""
     ordered = image[:, :, ::-1] if image.ndim == 3 else image

@@ -1,13 +1,10 @@
-"""Triangle meshes with colours: .ply, .glb and .obj, their simplification by COLMAP; points."""
+"""Triangle meshes with colours or a texture: .ply, .glb, .obj; simplification by COLMAP; points."""
 
 from __future__ import annotations
 
 import os
-import struct
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -15,65 +12,48 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.workspace.atomic import parse_json, write_bytes
+from recon_cli.io.mesh_data import TINT, Mesh, Texture
+from recon_cli.io.mesh_glb import glb_bytes, read_glb
+from recon_cli.io.mesh_obj import read_obj, write_obj
+from recon_cli.workspace.atomic import write_bytes
+
+__all__ = ["SUFFIXES", "Mesh", "Texture", "read_mesh", "simplify", "write_mesh",
+           "write_point_cloud"]
 
 SUFFIXES = ("ply", "glb", "obj")
-_UNLIT = "KHR_materials_unlit"  # the photos hold the light of the room already
-# Linear light of each sRGB code (IEC 61966-2-1), which glTF wants in COLOR_0, in 16 bits: 8 would
-# merge the dark codes
-_CODES = np.arange(256) / 255
-_LIGHT = np.rint(65535 * np.where(
-    _CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4)).astype(np.uint16)
+_INFERRED = "inferred"  # property of the vertices of a .ply
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """A triangle mesh."""
+def write_mesh(
+    path: Path, mesh: Mesh, *, axes: NDArray[np.float64] | None = None, tint: bool = False
+) -> None:
+    """Writes a mesh in the format of the file's suffix, each file atomically.
 
-    vertices: NDArray[np.float64]  # [V, 3]
-    faces: NDArray[np.int64]  # [F, 3], counter-clockwise from outside
-    colors: NDArray[np.uint8]  # [V, 3] RGB
-
-
-def write_mesh(path: Path, mesh: Mesh, *, axes: NDArray[np.float64] | None = None) -> None:
-    """Writes a mesh in the format of the file's suffix, atomically.
-
-    `axes` [3, 3] are the axes of the file in those of the mesh, as in `glb.write_glb`.
+    An .obj also gets an .mtl and its image beside it, if it has a texture or inferred surface; a
+    .ply has no texture. `axes` [3, 3] are the axes of the file in those of the mesh, as in
+    `glb.write_glb`. `tint` shows what is inferred in blue.
     """
-    vertices = mesh.vertices if axes is None else mesh.vertices @ axes.T
-    kind, places = path.suffix[1:].lower(), vertices.astype(np.float32)
-    if kind == "glb":
-        write_bytes(path, _glb_bytes(places, mesh.faces, mesh.colors))
-        return
-    whole = trimesh.Trimesh(places, mesh.faces, vertex_colors=mesh.colors, process=False)
-    data = whole.export(file_type=kind)
-    write_bytes(path, data.encode() if isinstance(data, str) else data)
+    kind = path.suffix[1:].lower()
+    if axes is not None:
+        mesh = Mesh(mesh.vertices @ axes.T, mesh.faces, mesh.colors, mesh.inferred, mesh.texture)
+    match kind:
+        case "glb":
+            write_bytes(path, glb_bytes(mesh, TINT if tint else None))
+        case "obj":
+            write_obj(path, mesh, TINT if tint else None)
+        case _:
+            write_bytes(path, _ply_bytes(mesh, tint))
 
 
-def _glb_bytes(
-    vertices: NDArray[np.float32], faces: NDArray[np.int64], colors: NDArray[np.uint8]
-) -> bytes:
-    """Returns a .glb whose colours are shown as they are, without lights.
-
-    trimesh writes colours in 8 bits alone, so they go in as an attribute that is renamed.
-    """
-    opaque = np.full((len(colors), 1), 65535, np.uint16)
-    light = np.concatenate([_LIGHT[colors], opaque], axis=1)
-    whole = trimesh.Trimesh(
-        vertices, faces, vertex_attributes={"_COLOR_0": light}, process=False)
-
-    def add_material(tree: dict[str, Any]) -> None:
-        primitive = tree["meshes"][0]["primitives"][0]
-        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
-        tree["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] = True
-        primitive["material"] = 0
-        tree["materials"] = [{  # not metallic, as the default would be
-            "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
-            "extensions": {_UNLIT: {}}}]
-        tree["extensionsUsed"] = [*tree.get("extensionsUsed", ()), _UNLIT]
-
-    data: bytes = trimesh.exchange.gltf.export_glb(
-        trimesh.Scene(whole), tree_postprocessor=add_material)
+def _ply_bytes(mesh: Mesh, tint: bool) -> bytes:
+    colors = mesh.colors
+    if mesh.inferred is not None and tint:
+        colors = np.where(
+            mesh.inferred[:, None], np.rint(colors * TINT), colors).astype(np.uint8)
+    marks = {} if mesh.inferred is None else {_INFERRED: mesh.inferred.astype(np.uint8)}
+    whole = trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, vertex_colors=colors,
+                            vertex_attributes=marks, process=False)
+    data: bytes = whole.export(file_type="ply")
     return data
 
 
@@ -86,32 +66,23 @@ def write_point_cloud(
 
 def read_mesh(path: Path) -> Mesh:
     """Returns the mesh of a file as it is there; FormatError if it is damaged or holds none."""
+    readers = {".glb": read_glb, ".obj": read_obj}
     try:
-        mesh = trimesh.load_mesh(str(path), process=False)
-        if isinstance(mesh, trimesh.Scene):
-            mesh = mesh.to_mesh()
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        colors = (_read_glb_colors(path) if path.suffix.lower() == ".glb" else
-                  np.asarray(mesh.visual.vertex_colors, np.uint8)[:, :3])
+        mesh = readers.get(path.suffix.lower(), _read_ply)(path)
     except Exception as error:  # of trimesh and what it calls, of many kinds
         raise FormatError(f"{path} cannot be read as a mesh: {error}.") from error
-    if not len(faces) or not np.isfinite(vertices).all() or faces.max() >= len(vertices):
+    if (not len(mesh.faces) or not np.isfinite(mesh.vertices).all() or mesh.faces.min() < 0
+            or mesh.faces.max() >= len(mesh.vertices)):
         raise FormatError(f"{path} holds no triangles, or broken ones.")
-    return Mesh(vertices, faces, colors)
+    return mesh
 
 
-def _read_glb_colors(path: Path) -> NDArray[np.uint8]:
-    """Returns the colours [V, 3] of a .glb as `_glb_bytes` writes it: trimesh rounds to 8 bits."""
-    data = path.read_bytes()
-    (length,) = struct.unpack_from("<I", data, 12)
-    tree = parse_json(data[20:20 + length], dict)
-    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
-    view = tree["bufferViews"][accessor["bufferView"]]
-    start = 28 + length + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    light = np.frombuffer(data, "<u2", 4 * accessor["count"], start).reshape(-1, 4)[:, :3]
-    after = np.searchsorted(_LIGHT, light).clip(1, 255)
-    below = light - _LIGHT[after - 1].astype(int) < _LIGHT[after].astype(int) - light
-    return np.asarray(after - below, np.uint8)
+def _read_ply(path: Path) -> Mesh:
+    mesh = trimesh.load_mesh(str(path), process=False)
+    marks = mesh.metadata["_ply_raw"]["vertex"]["data"]
+    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64),
+                np.asarray(mesh.visual.vertex_colors, np.uint8)[:, :3],
+                marks[_INFERRED].reshape(-1) > 0 if _INFERRED in marks.dtype.names else None)
 
 
 def simplify(

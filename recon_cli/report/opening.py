@@ -20,7 +20,7 @@ from recon_cli.splats.html import find_title
 from recon_cli.trust.quality import Quality, delivered_model, describe_quality, name_view
 from recon_cli.trust.scene_trust import TrustRecord
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
-from recon_cli.workspace.export_record import ExportSummary, main_file
+from recon_cli.workspace.export_record import ExportedFile, ExportSummary, main_file
 from recon_cli.workspace.records import FOLDER, Frame, read_frame_list
 from recon_cli.workspace.summaries import SfmSummary
 
@@ -121,8 +121,14 @@ def _link_files(export: StageReport, page: Path) -> Iterator[ExportLink]:
         yield ExportLink(
             file.file, _link(export.folder / first, page), size,
             file.bytes / summary.bytes if file.bytes is not None and summary.bytes else None,
-            "-" if file.psnr_change_db is None else f"{file.psnr_change_db:+.2f} dB",
-            file.stale or "")
+            _describe_change(file), file.stale or "")
+
+
+def _describe_change(file: ExportedFile) -> str:
+    """Returns the PSNR that a file of Gaussians gains, or how much of a mesh is inferred."""
+    if file.inferred_share:
+        return f"{file.inferred_share:.1%} inferred"
+    return "-" if file.psnr_change_db is None else f"{file.psnr_change_db:+.2f} dB"
 
 
 def _link(path: Path, page: Path) -> str:

@@ -22,12 +22,13 @@ _ROUNDING = 1e-6  # of the largest coordinate: float32, and eight digits of text
 logger = logging.getLogger("recon")
 
 
-def write_mesh_file(path: Path, result: MeshResult, up: NDArray[np.float64]) -> Path:
+def write_mesh_file(
+    path: Path, mesh: Mesh, up: NDArray[np.float64], *, tint: bool = False
+) -> Path:
     """Writes a mesh, reads it back and compares; a .glb gets the axes of glTF."""
     axes = nearest_axes(up) if path.suffix == ".glb" else None
-    write_mesh(path, result.mesh, axes=axes)
-    _verify_mesh(path, result.mesh, axes)
-    logger.info("%s: %s", path.name, result.describe())
+    write_mesh(path, mesh, axes=axes, tint=tint)
+    _verify_mesh(path, mesh, axes, tint)
     return path
 
 
@@ -43,15 +44,36 @@ def write_plan(
     return out / "plan.svg"
 
 
-def _verify_mesh(path: Path, mesh: Mesh, axes: NDArray[np.float64] | None) -> None:
+def _verify_mesh(
+    path: Path, mesh: Mesh, axes: NDArray[np.float64] | None, tint: bool
+) -> None:
     """Raises WorkspaceError unless a file reads back as this mesh, in the axes of the file."""
     back = read_mesh(path)
     vertices = mesh.vertices if axes is None else mesh.vertices @ axes.T
     size = float(np.abs(vertices).max())
     same = (np.array_equal(back.faces, mesh.faces) and back.vertices.shape == vertices.shape
             and np.abs(back.vertices - vertices).max() <= _ROUNDING * size
-            and np.abs(back.colors.astype(int) - mesh.colors).max() <= 1)
+            and _same_look(back, mesh, tint and path.suffix == ".ply"))
     if not same:
         raise WorkspaceError(
             f"{path} does not read back as the mesh that was written.",
             hint="Check the disk, then run `recon export --again`.")
+
+
+def _same_look(back: Mesh, mesh: Mesh, tinted: bool) -> bool:
+    """Returns whether marks and either texture or colours are the same; `tinted` ones may differ.
+
+    A .jpg has other pixels, and a .ply has no texture.
+    """
+    if mesh.inferred is None or back.inferred is None:
+        if mesh.inferred is not back.inferred:
+            return False
+    elif not np.array_equal(back.inferred, mesh.inferred):
+        return False
+    if back.texture is not None and mesh.texture is not None:
+        image, other = back.texture.image, mesh.texture.image
+        return bool(image.shape == other.shape
+                    and np.abs(back.texture.corners - mesh.texture.corners).max() <= _ROUNDING
+                    and (mesh.texture.kind != "png" or np.array_equal(image, other)))
+    seen = ~mesh.inferred if tinted and mesh.inferred is not None else slice(None)
+    return bool(np.abs(back.colors[seen].astype(int) - mesh.colors[seen]).max() <= 1)

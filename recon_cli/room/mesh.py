@@ -7,7 +7,7 @@ behind others are seen by none.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,9 @@ from recon_cli.kernels.thread_pool import pool
 from recon_cli.kernels.viewpoint import viewpoint
 from recon_cli.machine import free_memory_bytes
 from recon_cli.room.depth_maps import DepthMaps, render_depth_maps, weigh_by_agreement
+from recon_cli.room.inferred import infer_surface
 from recon_cli.room.kernels import SEEN_THROUGH, SHOWN, observe
-from recon_cli.room.mesh_planes import surface_planes
+from recon_cli.room.mesh_planes import surface_planes, vertex_normals
 from recon_cli.room.planes import Plane
 from recon_cli.room.sensor_depths import with_sensor
 from recon_cli.room.stereo_depths import with_stereo
@@ -52,6 +53,7 @@ class MeshResult:
     voxel: float  # world units
     triangles_before: int  # before they were simplified
     planes: list[tuple[Plane, Plane | None]]  # if looked for: large ones, also confirmed
+    inferred: Mesh | None = None  # surface that closes holes in planes, if there is any
 
     def describe(self) -> str:
         """Returns triangles and voxels as part of a sentence."""
@@ -63,7 +65,7 @@ class MeshResult:
 
 def build_mesh(
     splats: Splats, views: Sequence[TrainView], points: NDArray[np.float64] | None,
-    ctx: StageContext, *, max_triangles: int, voxel: float | None = None,
+    ctx: StageContext, *, max_triangles: int, voxel: float | None = None, infer: bool = False,
 ) -> MeshResult:
     """Returns the mesh of the surfaces that the views show.
 
@@ -75,6 +77,7 @@ def build_mesh(
         ctx: backend, threads, progress, and notices.
         max_triangles: that are left.
         voxel: side of a voxel in world units; None for 1/128 of the median depth.
+        infer: whether to close holes in large planes.
 
     ReconstructionError if no surface is found, or it does not fit into memory.
     """
@@ -90,12 +93,12 @@ def build_mesh(
     maps = with_sensor(maps)
     with ctx.progress.bar("mesh", len(maps.views), unit="view") as bar:
         return mesh_of(maps, points, ctx, max_triangles=max_triangles, voxel=voxel,
-                       on_view=bar.advance)
+                       infer=infer, on_view=bar.advance)
 
 
 def mesh_of(
     maps: DepthMaps, points: NDArray[np.float64] | None, ctx: StageContext, *, max_triangles: int,
-    voxel: float | None = None, on_view: Callable[[], None] = lambda: None,
+    voxel: float | None = None, infer: bool = False, on_view: Callable[[], None] = lambda: None,
 ) -> MeshResult:
     """Returns the mesh of depth maps; see `build_mesh`."""
     weigh_by_agreement(maps)
@@ -118,7 +121,11 @@ def mesh_of(
             hint="Allow more.")
     _, colors = observe_all(maps, vertices, faces)
     mesh = Mesh(vertices, faces, _fill(vertices, colors))
-    return MeshResult(mesh, voxel, before, planes)
+    inferred = infer_surface(mesh, maps, voxel) if infer else None
+    if inferred is not None:
+        _, sums = observe_all(maps, inferred.vertices, inferred.faces)
+        inferred = replace(inferred, colors=_fill(inferred.vertices, sums))
+    return MeshResult(mesh, voxel, before, planes, inferred)
 
 
 def _fit_voxel(
@@ -147,7 +154,7 @@ def observe_all(
     maps: DepthMaps, vertices: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Returns how often a vertex is shown and seen through [V, 2], and sums of colours [V, 4]."""
-    normals = _vertex_normals(vertices, faces)
+    normals = vertex_normals(vertices, faces)
     counts, colors = np.zeros((len(vertices), 2), np.int32), np.zeros((len(vertices), 4))
     for view, camera, depth in zip(maps.views, maps.cameras, maps.depths, strict=True):
         pool.run(
@@ -155,18 +162,6 @@ def observe_all(
             np.ascontiguousarray(view.image).reshape(-1), _TOLERANCE, float(maps.near), counts,
             colors, scratch=False)
     return counts, colors
-
-
-def _vertex_normals(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Returns unit normals [V, 3], means of those of the triangles weighted by area."""
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    rows = faces.reshape(-1)
-    sums = np.stack([np.bincount(rows, np.repeat(normals[:, axis], 3), len(vertices))
-                     for axis in range(3)], axis=1)
-    return np.asarray(sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30))
 
 
 def _drop_islands(

@@ -32,3 +32,15 @@ def face_geometry(
     lengths = np.linalg.norm(normals, axis=1)
     there = lengths > 0
     return (corners[there].mean(axis=1), normals[there] / lengths[there, None], lengths[there] / 2)
+
+
+def vertex_normals(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Returns unit normals [V, 3], means of those of the triangles weighted by area."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    rows = faces.reshape(-1)
+    sums = np.stack([np.bincount(rows, np.repeat(normals[:, axis], 3), len(vertices))
+                     for axis in range(3)], axis=1)
+    return np.asarray(sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30))

@@ -16,6 +16,8 @@ MAX_LOSS_DB = 0.3  # on the validation views, where a row and --max-loss say not
 PLAN = "plan.svg"
 _STEM = "splats"
 _MESH_OPTIONS = ("max_triangles", "voxel")
+_SURFACE_OPTIONS = (*_MESH_OPTIONS, "inferred")
+_TEXTURE_OPTIONS = (*_SURFACE_OPTIONS, "texture", "texture_format")
 # Gaussians per entry of the palette of colours, on the mean: the smallest file first
 _SHARING = (16, 8, 4, 2, 1)
 
@@ -79,9 +81,10 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
         "sparse/*", "images/*", "database.db", "colmap/*")),  # colmap/: before version 5
     ExportFormat("transforms.json", "cameras", "transforms.json", more_files=(
         "sparse_pc.ply", "images/*", "depth/*")),
-    ExportFormat("mesh.ply", "mesh", "mesh.ply", options=_MESH_OPTIONS),
-    ExportFormat("mesh.glb", "mesh", "mesh.glb", options=_MESH_OPTIONS),
-    ExportFormat("mesh.obj", "mesh", "mesh.obj", options=_MESH_OPTIONS),
+    ExportFormat("mesh.ply", "mesh", "mesh.ply", options=_SURFACE_OPTIONS),
+    ExportFormat("mesh.glb", "mesh", "mesh.glb", options=_TEXTURE_OPTIONS),
+    ExportFormat("mesh.obj", "mesh", "mesh.obj", more_files=(
+        "mesh.mtl", "mesh.png", "mesh.jpg"), options=_TEXTURE_OPTIONS),
     ExportFormat(PLAN, "plan", PLAN, more_files=("measures.json",), options=_MESH_OPTIONS),
 )}
 

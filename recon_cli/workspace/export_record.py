@@ -108,6 +108,7 @@ class ExportedFile(JsonRecord):
     smaller: float | None = None  # size of the .ply over its size
     psnr_change_db: float | None = None  # on the views that the export is checked on
     psnr_db: float | None = None  # of the file on them; None where an older version wrote it
+    inferred_share: float | None = None  # of a mesh: share of its area that no view confirms
     # sources: version, model, digests of stages, options; None where an older version wrote it
     made_of: Mapping[str, Any] | None = None
     stale: str | None = None  # why it no longer fits the .ply; None where it does

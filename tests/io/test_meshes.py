@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 
 from recon_cli.errors import FormatError
-from recon_cli.io.meshes import SUFFIXES, Mesh, read_mesh, simplify, write_mesh
+from recon_cli.io.mesh_data import TINT, joined
+from recon_cli.io.meshes import SUFFIXES, Mesh, Texture, read_mesh, simplify, write_mesh
 from recon_cli.splats.glb import Z_UP
 
 pytestmark = pytest.mark.floors
@@ -93,3 +95,75 @@ def test_few_triangles_are_as_many_as_were_asked_for():
     vertices, faces = simplify(mesh.vertices, mesh.faces, 10, threads=1)
     assert 0 < len(faces) <= 10
     assert faces.max() < len(vertices)
+
+
+def plate(z: float, inferred: bool, size: int = 8) -> Mesh:
+    """A textured square whose vertices all have a place of their own in the image."""
+    vertices = np.array([[0, 0, z], [1, 0, z], [1, 1, z], [0, 1, z]], float)
+    image = np.random.default_rng(1).integers(0, 256, (size, size, 3)).astype(np.uint8)
+    image = np.kron(image, np.ones((16, 16, 1), np.uint8))  # what .jpg keeps, too
+    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.full((4, 3), 200, np.uint8),
+                np.full(4, inferred), Texture(image, vertices[:, :2] * (0.5, 0.25) + 0.125))
+
+
+def walls(kind: str = "png") -> Mesh:
+    """A square that views show, and one that is inferred."""
+    one, other = plate(0.0, False), plate(1.0, True)
+    both = joined(one, other)
+    corners = np.concatenate([one.texture.corners, other.texture.corners[::-1]])
+    return replace(both, texture=Texture(one.texture.image, corners, kind))
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+@pytest.mark.parametrize("suffix", ["glb", "obj"])
+def test_a_texture_comes_back_with_its_places(suffix, kind, tmp_path):
+    mesh = walls(kind)
+    write_mesh(tmp_path / f"mesh.{suffix}", mesh)
+    back = read_mesh(tmp_path / f"mesh.{suffix}")
+    assert np.array_equal(back.faces, mesh.faces)
+    assert np.allclose(back.vertices, mesh.vertices)
+    assert np.allclose(back.texture.corners, mesh.texture.corners, atol=1e-6)
+    off = np.abs(back.texture.image.astype(int) - mesh.texture.image)
+    assert off.max() == 0 if kind == "png" else off.mean() < 8
+    assert back.texture.kind == kind
+    assert back.inferred.tolist() == [False] * 4 + [True] * 4
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj"])
+def test_trimesh_reads_texture_and_inferred_surface_by_name(suffix, tmp_path):
+    mesh = walls()
+    path = tmp_path / f"mesh.{suffix}"
+    write_mesh(path, mesh, tint=True)
+    scene = trimesh.load_scene(str(path), process=False)
+    parts = {part.visual.material.name: part for part in scene.geometry.values()}
+    assert sorted(parts) == ["inferred", "surface"]
+    for part, row in ((parts["surface"], 0), (parts["inferred"], 1)):
+        corners = mesh.texture.corners[4 * row:4 * row + 4]
+        places = mesh.vertices[4 * row:4 * row + 4]
+        nearest = [int(np.linalg.norm(places - vertex, axis=1).argmin())
+                   for vertex in part.vertices]
+        assert np.allclose(part.visual.uv[:, 0], corners[nearest, 0], atol=1e-6)
+        assert np.allclose(1 - part.visual.uv[:, 1], corners[nearest, 1], atol=1e-6)
+        material = part.visual.material
+        image = getattr(material, "baseColorTexture", None) or material.image
+        assert np.array_equal(np.asarray(image.convert("RGB")), mesh.texture.image)
+
+
+def test_inferred_surface_is_marked_and_tinted_in_a_ply(tmp_path):
+    path = tmp_path / "mesh.ply"
+    write_mesh(path, walls(), tint=True)
+    back = read_mesh(path)
+    assert back.inferred.tolist() == [False] * 4 + [True] * 4
+    assert (back.colors[:4] == 200).all()
+    assert (back.colors[4:] == np.rint(np.multiply(200, TINT))).all()
+
+
+def test_the_tint_of_a_glb_is_in_the_material_alone(tmp_path):
+    for tint in (False, True):
+        write_mesh(tmp_path / "mesh.glb", walls(), tint=tint)
+        data = (tmp_path / "mesh.glb").read_bytes()
+        (length,) = struct.unpack_from("<I", data, 12)
+        surface, inferred = json.loads(data[20:20 + length])["materials"]
+        assert "baseColorFactor" not in surface["pbrMetallicRoughness"]
+        assert ("baseColorFactor" in inferred["pbrMetallicRoughness"]) == tint
+        assert read_mesh(tmp_path / "mesh.glb").texture is not None

@@ -1,0 +1,254 @@
+"""Surface that no view confirms: holes in the large planes of a room, closed where that is certain.
+
+A blank wall gives stereo nothing to match, and its mesh has holes. A hole is closed if it lies in
+a plane of the mesh and surface of this plane, or of another one at their common edge, surrounds it
+on all sides. What a wall has to hide is left open, and what rays crossed: doors, windows, niches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt
+
+from recon_cli.io.mesh_data import Mesh
+from recon_cli.kernels.thread_pool import pool
+from recon_cli.room.charts import plane_axes
+from recon_cli.room.depth_maps import DepthMaps
+from recon_cli.room.mesh_planes import face_geometry
+from recon_cli.room.planes import Plane, find_planes
+from recon_cli.room.texture import draw_mesh
+from recon_cli.room.texture_kernels import draw
+from recon_cli.scene.camera import Camera
+
+_BAND = 2.0  # voxels, within which surface belongs to a plane
+_LEAST_COSINE = 0.8  # between its normal and that of the plane
+_CLOSED = 2  # cells of a gap in what surrounds a hole
+_REACH = 3.0  # cells, from a plane to the surface of another one that meets it
+_AGREE = 0.05  # of a depth, within which a view shows the plane, not what lies behind it
+_LEAST_AGREE = 2  # views that show it there
+_MOST_CROSSED = 0.25  # share of them and of those whose rays cross it, that may cross it
+_MOST_VIEWS = 100  # that are asked about a hole
+_LEAST_CELLS = 12  # of a hole
+_MOST_CELLS = 4_000_000  # of the grid of a plane
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """A plane in cells of a voxel."""
+
+    axes: NDArray[np.float64]  # [3, 3] right, up and normal
+    low: NDArray[np.float64]  # [3] its corner in these axes; the third is the height of the plane
+    cell: float
+    shape: tuple[int, int]  # rows, columns
+
+    def places(self, rows: NDArray[np.int64], columns: NDArray[np.int64],
+               heights: NDArray[np.float64], shift: float = 0.0) -> NDArray[np.float64]:
+        """Returns the places [N, 3] of corners of cells at heights over the plane.
+
+        With a `shift` of 1/2 they are the middles of cells.
+        """
+        local = np.stack([(columns + shift) * self.cell, (rows + shift) * self.cell, heights],
+                         axis=1) + self.low
+        return local @ self.axes
+
+    def local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns column, row (in cells) and height over the plane [N, 3] of points."""
+        moved = points @ self.axes.T - self.low
+        return np.concatenate([moved[:, :2] / self.cell, moved[:, 2:]], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A view of the scene."""
+
+    camera: Camera
+    depth: NDArray[np.float32]  # [H, W] 0 where there is none
+    nearness: NDArray[np.float32]  # [H, W] 1 / depth of the mesh, 0 where there is none
+
+
+def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
+    """Returns the surface that closes holes in the planes of a mesh; None if there is none.
+
+    Args:
+        mesh: what views show.
+        maps: the depth maps that it was made of.
+        voxel: side of its voxels, world units.
+    """
+    centers, normals, areas = face_geometry(mesh.vertices, mesh.faces)
+    planes = find_planes(centers, normals, areas, _BAND * voxel)
+    views = _look(maps, mesh)
+    vertices, faces, count = [], [], 0
+    for plane in planes:
+        found = _close(plane, planes, mesh, views, voxel)
+        if found is not None:
+            vertices.append(found[0])
+            faces.append(found[1] + count)
+            count += len(found[0])
+    if not count:
+        return None
+    return Mesh(np.concatenate(vertices), np.concatenate(faces),
+                np.zeros((count, 3), np.uint8), np.ones(count, bool))
+
+
+def _look(maps: DepthMaps, mesh: Mesh) -> list[_Look]:
+    """Returns up to `_MOST_VIEWS` of the maps, evenly spread, and the mesh in them."""
+    rows = np.unique(np.linspace(
+        0, len(maps.cameras) - 1, min(len(maps.cameras), _MOST_VIEWS)).round().astype(int))
+    return [_Look(maps.cameras[row], maps.depths[row], draw_mesh(
+        maps.cameras[row], mesh.vertices, mesh.faces).nearness) for row in rows]
+
+
+def _close(
+    plane: Plane, planes: Sequence[Plane], mesh: Mesh, views: Sequence[_Look], voxel: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+    """Returns vertices and triangles that close the holes of a plane; None if it has none."""
+    own = _own_faces(plane, mesh, voxel)
+    if not len(own):
+        return None
+    grid = _grid(plane, mesh.vertices[own].reshape(-1, 3), voxel)
+    if grid is None:
+        return None
+    heights = _heights(grid, mesh.vertices[own])
+    confirmed = np.isfinite(heights)
+    meets, beyond = _edges(grid, plane, planes, mesh, voxel)
+    holes = binary_fill_holes(_pad_close(confirmed | meets)) & ~confirmed & ~beyond
+    rows, columns = np.nonzero(holes)
+    if not len(rows):
+        return None
+    places = grid.places(rows, columns, np.zeros(len(rows)), 0.5)
+    holes[rows, columns] = _is_plane(places, views)
+    holes = _without_specks(holes)
+    if not holes.any():
+        return None
+    return _sheet(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
+
+
+def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
+    """Returns the triangles [K, 3] of the mesh in a plane."""
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
+    near = np.abs(corners @ plane.normal - plane.offset).max(axis=1) < _BAND * voxel
+    return np.asarray(mesh.faces[near & (normals @ plane.normal > _LEAST_COSINE * lengths)])
+
+
+def _grid(plane: Plane, points: NDArray[np.float64], cell: float) -> _Grid | None:
+    """Returns the grid that holds points with a cell to spare, None if it would be huge."""
+    axes = plane_axes(plane.normal)
+    flat = points @ axes.T
+    low, high = flat.min(axis=0) - 2 * cell, flat.max(axis=0) + 2 * cell
+    low[2] = plane.offset
+    columns, rows = (int(side) for side in np.ceil((high - low)[:2] / cell))
+    return _Grid(axes, low, cell, (rows, columns)) if rows * columns <= _MOST_CELLS else None
+
+
+def _heights(grid: _Grid, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the height [H, W] of triangles [K, 3, 3] over the cells, NaN where there is none."""
+    local = grid.local(corners.reshape(-1, 3))
+    shift = 1 - float(local[:, 2].min())  # the kernel wants numbers above 0
+    local[:, 2] += shift
+    top = np.zeros(grid.shape, np.float32)
+    owners = np.full(grid.shape, -1, np.int32)
+    pool.run(draw, local, np.arange(len(local)).reshape(-1, 3), top, owners, scratch=False)
+    return np.where(owners >= 0, top - shift, np.nan)
+
+
+def _edges(
+    grid: _Grid, plane: Plane, planes: Sequence[Plane], mesh: Mesh, voxel: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Returns the cells where surface of other planes meets this one, and those behind it."""
+    meets, beyond = np.zeros((2, *grid.shape), bool)
+    shift = 0.5 * grid.cell
+    for other in planes:
+        if other is plane or abs(float(other.normal @ plane.normal)) > 1 - _LEAST_COSINE:
+            continue
+        faces = _own_faces(other, mesh, voxel)
+        if not len(faces):
+            continue
+        local = grid.local(mesh.vertices[faces].mean(axis=1))
+        local = local[np.abs(local[:, 2]) < _REACH * grid.cell]
+        column, row = np.floor(local[:, :2]).astype(int).T
+        inside = (row >= 0) & (column >= 0) & (row < grid.shape[0]) & (column < grid.shape[1])
+        touched = np.zeros(grid.shape, np.uint8)
+        touched[row[inside], column[inside]] = 1
+        rows, columns = np.nonzero(cv2.dilate(touched, np.ones((5, 5), np.uint8)))
+        behind = other.heights(grid.places(rows, columns, np.zeros(len(rows)), 0.5)) < -shift
+        meets[rows, columns] = True
+        beyond[rows[behind], columns[behind]] = True
+    return meets, beyond
+
+
+def _pad_close(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Returns cells with narrow gaps between them closed."""
+    padded = np.pad(cells, _CLOSED + 1)
+    closed = binary_closing(padded, iterations=_CLOSED)
+    inner = slice(_CLOSED + 1, -_CLOSED - 1)
+    return np.asarray(closed[inner, inner] | cells)
+
+
+def _is_plane(
+    places: NDArray[np.float64], views: Sequence[_Look]
+) -> NDArray[np.bool_]:
+    """Returns at which places [N] views show the plane, and next to none looks through it."""
+    agree, crossed = np.zeros((2, len(places)))
+    for view in views:
+        z, inside, row, column = _pixels(view.camera, places)
+        seen = view.depth[row, column]
+        hidden = view.nearness[row, column] > (1 + _AGREE) / z  # behind the mesh
+        looks = inside & ~hidden & (seen > 0)
+        agree += looks & (np.abs(seen - z) <= _AGREE * z)
+        crossed += looks & (seen > (1 + _AGREE) * z)
+    return np.asarray((agree >= _LEAST_AGREE) & (crossed <= _MOST_CROSSED * (agree + crossed)))
+
+
+def _pixels(
+    camera: Camera, places: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Returns depths, which places are in the image, and their rows and columns."""
+    local = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = np.where(local[:, 2] > 1e-6, local[:, 2], np.inf)
+    column = np.floor(camera.fx * local[:, 0] / z + camera.cx)
+    row = np.floor(camera.fy * local[:, 1] / z + camera.cy)
+    inside = (np.isfinite(z) & (column >= 0) & (row >= 0) & (column < camera.width)
+              & (row < camera.height))
+    return (z, inside, np.where(inside, row, 0).astype(np.int64),
+            np.where(inside, column, 0).astype(np.int64))
+
+
+def _without_specks(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Returns holes without what is narrower than two cells or smaller than `_LEAST_CELLS`."""
+    smooth = cv2.medianBlur(holes.astype(np.uint8), 3)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(smooth, connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST_CELLS
+    large[0] = False
+    return np.asarray(large[labels])
+
+
+def _sheet(
+    grid: _Grid, holes: NDArray[np.bool_], confirmed: NDArray[np.bool_],
+    heights: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Returns vertices and triangles over the cells of holes and a ring around them.
+
+    Their height is that of the nearest surface at the rim, and falls to that of the plane.
+    """
+    cells = holes | (cv2.dilate(holes.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & confirmed
+    apart, (row, column) = distance_transform_edt(~confirmed, return_indices=True)
+    level = heights[row, column] / (1 + apart)
+    rows, columns = np.nonzero(cells)
+    corner = np.stack([np.stack([rows + dy, columns + dx], axis=1)
+                       for dy, dx in ((0, 0), (0, 1), (1, 1), (1, 0))], axis=1)
+    wide = grid.shape[1] + 1
+    keys, numbers = np.unique(corner[..., 0] * wide + corner[..., 1], return_inverse=True)
+    numbers = numbers.reshape(-1, 4)
+    # a corner lies at the mean height of its cells
+    sums = np.bincount(numbers.reshape(-1), level[rows, columns].repeat(4))
+    counts = np.bincount(numbers.reshape(-1))
+    places = grid.places(keys // wide, keys % wide, sums / counts)
+    faces = np.concatenate([numbers[:, [0, 1, 2]], numbers[:, [0, 2, 3]]])
+    return places, faces.astype(np.int64)
