@@ -56,6 +56,10 @@ def test_units_and_orders_of_rows_are_told_apart(taken, change, words):
     assert found == words or (words and words in found)
 
 
+def test_a_flat_depth_that_no_unit_explains_is_not_accused(taken):
+    assert find_fault(posed(taken, lambda depth: np.full_like(depth, 2.0))) == ""
+
+
 def test_poses_of_another_walk_accuse_no_depth(taken):
     images = posed(taken, lambda depth: depth)
     rng = np.random.default_rng(1)
