@@ -96,7 +96,9 @@ def fuse(sources: Sequence[ScaleSource], *, decisive: str | None = None) -> Fuse
         if farthest > MOST_UNSURE:
             return FusedScale(None, math.inf, used, others)
         error = max(error, farthest / INTERVAL)
-    return FusedScale(math.exp(mean), error, used, others)
+    # to the bit where one source decides
+    scale = used[0].scale if len(used) == 1 else math.exp(mean)
+    return FusedScale(scale, error, used, others)
 
 
 def fuse_measured(scale: float, error: float, known: Sequence[ScaleSource]) -> FusedScale:

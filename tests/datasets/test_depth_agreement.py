@@ -56,6 +56,15 @@ def test_units_and_orders_of_rows_are_told_apart(taken, change, words):
     assert found == words or (words and words in found)
 
 
+def test_depth_that_fits_better_the_farther_it_is_is_not_accused(taken):
+    """On a sphere around each camera no motion shows, once the sphere is large."""
+    def on_a_sphere(depth):
+        rows, columns = np.mgrid[:depth.shape[0], :depth.shape[1]]
+        return 2 / np.sqrt(1 + ((columns * 4 - 148) / 150)**2 + ((rows * 4 - 83) / 150)**2)
+
+    assert find_fault(posed(taken, on_a_sphere)) == ""
+
+
 def test_poses_of_another_walk_accuse_no_depth(taken):
     images = posed(taken, lambda depth: depth)
     rng = np.random.default_rng(1)
