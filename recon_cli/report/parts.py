@@ -72,8 +72,11 @@ def read_parts(stages: StageReports) -> Parts:
         return Parts()
     ingest, damaged = stages["ingest"].folder, []
     try:
-        frames = read_frame_list(ingest).frames
-        moments = tuple(_read_moment(ingest, gap) for gap in find_moments(frames, sfm.parts))
+        known = read_frame_list(ingest)
+        frames = known.frames
+        panoramas = any(group.lens is not None and group.lens.is_panorama for group in known.groups)
+        moments = tuple(_read_moment(ingest, gap, panoramas=panoramas)
+                        for gap in find_moments(frames, sfm.parts))
     except (FormatError, OSError) as error:
         return Parts(damaged=(f"The parts of the capture are not shown: {error}",))
     views = []
@@ -144,18 +147,22 @@ def find_moments(frames: Sequence[Frame], parts: Sequence[PartSummary]) -> list[
     return [gap for gap in gaps if gap in chosen][:_MOST]
 
 
-def _read_moment(ingest: Path, gap: Gap) -> Moment:
+def _read_moment(ingest: Path, gap: Gap, *, panoramas: bool) -> Moment:
     pictures = [
         data_uri(fit_image(read_png(ingest / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY)
         for frame in (gap.before, gap.after)]
     times = _format_time(gap.before), _format_time(gap.after)
     return Moment(gap.numbers, (gap.before.name, gap.after.name), times,
-                  (pictures[0], pictures[1]), gap.lost, advise(gap))
+                  (pictures[0], pictures[1]), gap.lost,
+                  advise(gap, panoramas=panoramas))
 
 
-def advise(gap: Gap) -> str:
+def advise(gap: Gap, *, panoramas: bool = False) -> str:
     """Returns a sentence on where to film to join two parts."""
     first, second = _format_time(gap.before), _format_time(gap.after)
+    if panoramas and not (first and second):
+        return (f"Take panoramas half a metre apart on the way from where {gap.before.name} was "
+                f"taken to where {gap.after.name} was taken, one of them in each doorway.")
     if not first or not second:
         return (f"Take ten or more photos on the way from where {gap.before.name} was taken to "
                 f"where {gap.after.name} was taken; each overlaps the one before by half.")

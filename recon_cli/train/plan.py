@@ -50,6 +50,9 @@ _LONGEST_RUN = 100_000  # steps; three times the reference's
 _DETAIL = 4.0  # grey levels a pixel; camera noise stays below it after denoising
 _DETAIL_VIEWS = 16  # looked at; the mean of more differs by less than 3%
 _FULL_AT = 2400  # steps after which there may be a Gaussian for each pixel with detail
+# Faces of a panorama that count as one view: pixels of a panorama are coarser than a phone's, and
+# half of its faces show a floor, a ceiling or whoever carries the camera.
+_FACES = 2
 _VIEWS_EACH = 8  # views that must show a Gaussian, about, to tell where it is
 _FIRST = 0.5  # of the cap, at the start
 _FEWEST = 5000
@@ -182,6 +185,13 @@ def useful_cap(facts: Facts, iterations: int) -> int:
     return max(_FEWEST, round(facts.detail * share / _ROUND) * _ROUND)
 
 
+def gather_facts(task: Task, scene: Scene, room: int) -> Facts:
+    """Returns the facts on a scene; `room` as in `Facts`. Of panoramas two faces are one view."""
+    each = _FACES if any(view.face_of is not None for view in scene.train) else 1
+    return Facts(
+        each * count_detail(task.train), max(1, len(task.train) // each), len(scene.points), room)
+
+
 def count_detail(views: Sequence[TrainView]) -> int:
     """Returns how many unmasked pixels of a mean view have a gradient above 4 grey levels."""
     chosen = np.unique(np.linspace(0, len(views) - 1, _DETAIL_VIEWS).round().astype(int))
@@ -242,7 +252,7 @@ def plan_task(
         scene = with_masks(scene, out)
         task = load_task(scene, dataclasses.replace(first, images=needs.config.images), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
-    facts = Facts(count_detail(task.train), len(task.train), len(scene.points), fit_memory)
+    facts = gather_facts(task, scene, fit_memory)
     spent = 0.0 if model is not None else needs.seconds + _search_surfaces(
         probe_config(asked, facts), facts, task)
     cost = _measure_cost(asked, facts, task, scene, out)

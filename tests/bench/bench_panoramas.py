@@ -41,10 +41,10 @@ def errors(found: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np
     return np.asarray(np.linalg.norm(scale * ours @ turn.T - theirs, axis=1))
 
 
-def find_cameras(pictures: Path, workspace: Path, *options: str) -> float:
+def find_cameras(pictures: Path, workspace: Path) -> float:
     """Runs ingest and sfm; returns the CPU seconds of sfm."""
     run_recon(workspace, "ingest", str(pictures), "--quiet")
-    return run_recon(workspace, "sfm", *options, "--quiet").cpu_seconds
+    return run_recon(workspace, "sfm", "--quiet").cpu_seconds
 
 
 @click.command()
@@ -63,7 +63,7 @@ def main(data: Path) -> None:
             click.echo(f"{room}: {len(found)} of {len(names)}, RMSE "
                        f"{100 * np.sqrt((off**2).mean()):.3f} cm, {seconds:.0f} CPU s")
         workspace = Path(scratch) / "house"
-        find_cameras(data / "house_360" / "images", workspace, "--min-registered", "0.2")
+        find_cameras(data / "house_360" / "images", workspace)
         with (data / "house_360" / "positions.csv").open() as file:
             places = {row["file"]: np.array([float(row[axis]) for axis in "xyz"])
                       for row in csv.DictReader(file)}

@@ -63,6 +63,7 @@ def test_what_to_film_is_said_with_its_time():
     assert_facts(advise(gap), "a.mp4 at 0:04", "b.mp4 at 0:00")
     gap, = find_moments(film(9, seconds=None), parts(range(4), range(6, 9)))
     assert_facts(advise(gap), "photos", "000003.png", "000006.png")
+    assert_facts(advise(gap, panoramas=True), "panoramas", "000003.png", "000006.png", "doorway")
 
 
 def test_a_part_tells_when_it_was_seen():

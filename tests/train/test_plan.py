@@ -65,7 +65,8 @@ def test_minutes_include_a_search_for_surfaces_that_only_the_longer_run_has_room
 
     task = tiny_task(RunConfig(stereo="on"))
     task = replace(task, train=20 * task.train, stereo=Slow())
-    scene = SimpleNamespace(points=np.zeros((9000, 3)), colors=np.zeros((9000, 3), np.uint8))
+    scene = SimpleNamespace(
+        train=(), points=np.zeros((9000, 3)), colors=np.zeros((9000, 3), np.uint8))
     for name, value in {
             "gaussians_that_fit": 10**9, "load_task": task, "count_detail": 16_000,
             "choose_parts": Needs(RunConfig(stereo="on"), ()), "_measure_cost": COST}.items():
@@ -137,6 +138,16 @@ def test_detail_counts_the_pixels_at_edges():
     hidden = np.ones((20, 30), bool)
     hidden[:10] = False
     assert plan.count_detail([view(edge, hidden)]) == 20
+
+
+def test_two_faces_of_panoramas_count_as_one_view():
+    edge = np.full((20, 30, 3), 90, np.uint8)
+    edge[:, 15:] = 190
+    task = SimpleNamespace(train=[view(edge)] * 12)
+    facts = [plan.gather_facts(task, SimpleNamespace(
+        train=[SimpleNamespace(face_of=face)] * 12, points=np.zeros((7, 3))), 10**9)
+        for face in (None, "a.png")]
+    assert facts == [Facts(40, 12, 7, 10**9), Facts(80, 6, 7, 10**9)]
 
 
 def test_faint_noise_is_no_detail():
