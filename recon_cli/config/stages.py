@@ -221,7 +221,7 @@ class TrainConfig(StageConfig):
         choices=("auto", "on", "off"))
     moving: str = option(
         "auto", "Mask people and things that move; auto: where views contradict the others.",
-        choices=("auto", "on", "off"), late=True)
+        choices=("auto", "on", "off"), late=True, expert=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -395,7 +395,7 @@ class ImportConfig(StageConfig):
         600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
     moving: str = option(
         "auto", "Mask people and things that move; auto: where views contradict the others.",
-        choices=("auto", "on", "off"), late=True)
+        choices=("auto", "on", "off"), late=True, expert=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
 
 
