@@ -110,7 +110,7 @@ def write_masks(
         regions: where each of `masked_views` shows what moves; None: nowhere.
         edited: what a user says instead.
     """
-    remove(out / FOLDER)  # of a run that ended before its plan was written
+    _remove_masks(out)
     shares: dict[str, float] = {}
     by_hand: list[str] = []
     views = masked_views(scene)
@@ -134,6 +134,12 @@ def write_masks(
     return summary
 
 
+def _remove_masks(out: Path) -> None:
+    """Removes those of a run that ended before its plan was written."""
+    remove(out / FOLDER)
+    remove(out / MovingSummary.FILE)
+
+
 def read_summary(folder: Path) -> MovingSummary | None:
     """Returns what a training masked, None where it masked nothing."""
     path = folder / MovingSummary.FILE
@@ -148,6 +154,7 @@ def read_summary(folder: Path) -> MovingSummary | None:
 
 def copy_masks(folder: Path, out: Path) -> None:
     """Copies the masks of a finished training and their record to that which continues it."""
+    _remove_masks(out)
     summary = read_summary(folder)
     if summary is None:
         return

@@ -185,11 +185,13 @@ def useful_cap(facts: Facts, iterations: int) -> int:
     return max(_FEWEST, round(facts.detail * share / _ROUND) * _ROUND)
 
 
-def gather_facts(task: Task, scene: Scene, room: int) -> Facts:
-    """Returns the facts on a scene; `room` as in `Facts`. Of panoramas two faces are one view."""
+def gather_facts(task: Task, scene: Scene, room: int, detail: int) -> Facts:
+    """Returns the facts on a scene; `room` as in `Facts`, `detail` by `count_detail`.
+
+    Of panoramas two faces are one view.
+    """
     each = _FACES if any(view.face_of is not None for view in scene.train) else 1
-    return Facts(
-        each * count_detail(task.train), max(1, len(task.train) // each), len(scene.points), room)
+    return Facts(each * detail, max(1, len(task.train) // each), len(scene.points), room)
 
 
 def count_detail(views: Sequence[TrainView]) -> int:
@@ -229,11 +231,14 @@ def plan_task(
 
     `model` is the one that the run continues, with its parts; `edited` are a user's masks.
     """
-    if model is not None:
+    given, edited = scene, edited or EditedMasks()
+    planned = (out / TrainPlan.FILE).exists()
+    if not planned and model is not None:
         copy_masks(model.folder, out)
-    if model is not None or (out / TrainPlan.FILE).exists():
-        scene = with_masks(scene, out)
-    if (out / TrainPlan.FILE).exists():
+    elif not planned:
+        write_masks(out, scene, None, edited)
+    scene = with_masks(scene, out)
+    if planned:
         recorded = dataclasses.replace(read_config(out), checkpoint_every=config.checkpoint_every)
         schedule = make_schedule(recorded, TrainPlan.read(out).continues_at)
         return dataclasses.replace(load_task(scene, recorded, ctx), schedule=schedule)
@@ -247,12 +252,15 @@ def plan_task(
     task = load_task(scene, first, ctx)
     needs = Needs(first, model.decisions) if model is not None else choose_parts(
         task, scene, ctx, harmonics=config.sh_degree is None)
-    masked = model is None and write_masks(out, scene, needs.moving, edited or EditedMasks())
-    if masked or (needs.config.images == "denoised" and first.images != "denoised"):
-        scene = with_masks(scene, out)
+    if needs.config.images == "denoised" and first.images != "denoised":
+        task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
+    detail = count_detail(task.train)  # behind what moves there is as much as beside it
+    if needs.moving is not None:
+        write_masks(out, given, needs.moving, edited)
+        scene = with_masks(given, out)
         task = load_task(scene, dataclasses.replace(first, images=needs.config.images), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
-    facts = gather_facts(task, scene, fit_memory)
+    facts = gather_facts(task, scene, fit_memory, detail)
     spent = 0.0 if model is not None else needs.seconds + _search_surfaces(
         probe_config(asked, facts), facts, task)
     cost = _measure_cost(asked, facts, task, scene, out)
