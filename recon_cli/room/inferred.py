@@ -26,6 +26,7 @@ from recon_cli.room.texture_kernels import draw
 from recon_cli.scene.camera import Camera
 
 _BAND = 2.0  # voxels, within which surface belongs to a plane
+_NEAR = 6.0  # voxels, within which a bump is not a hole
 _LEAST_COSINE = 0.8  # between its normal and that of the plane
 _ACROSS = 0.2  # cosine between planes that meet, at most
 _CLOSED = 2  # cells of a gap in what surrounds a hole
@@ -87,7 +88,8 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
     sheets = [(plane, mesh.vertices[_own_faces(plane, mesh, voxel)]) for plane in planes]
     for number, (plane, own) in enumerate(sheets):
         others = [*sheets[:number], *sheets[number + 1:]]
-        found = _close(plane, own, others, views, voxel) if len(own) else None
+        near = mesh.vertices[_near_faces(plane, mesh, _NEAR * voxel)]
+        found = _close(plane, own, near, others, views, voxel) if len(own) else None
         if found is not None:
             vertices.append(found[0])
             faces.append(found[1] + count)
@@ -107,12 +109,13 @@ def _look(maps: DepthMaps, mesh: Mesh) -> list[_Look]:
 
 
 def _close(
-    plane: Plane, own: NDArray[np.float64], others: Sequence[tuple[Plane, NDArray[np.float64]]],
-    views: Sequence[_Look], voxel: float,
+    plane: Plane, own: NDArray[np.float64], near: NDArray[np.float64],
+    others: Sequence[tuple[Plane, NDArray[np.float64]]], views: Sequence[_Look], voxel: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Returns vertices and triangles that close the holes of a plane; None if it has none.
 
     `own` and the second of each of the `others` are triangles in the planes, as corners [K, 3, 3].
+    `near` are all beside this one: bumps of it, which are not holes.
     """
     grid = _grid(plane, own.reshape(-1, 3), voxel)
     if grid is None:
@@ -121,6 +124,7 @@ def _close(
     confirmed = np.isfinite(heights)
     meets, beyond = _edges(grid, plane, others)
     holes = binary_fill_holes(_pad_close(confirmed | meets)) & ~confirmed & ~beyond
+    holes &= ~np.isfinite(_heights(grid, near))
     rows, columns = np.nonzero(holes)
     if not len(rows):
         return None
@@ -139,6 +143,11 @@ def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
     near = np.abs(corners @ plane.normal - plane.offset).max(axis=1) < _BAND * voxel
     return np.asarray(mesh.faces[near & (normals @ plane.normal > _LEAST_COSINE * lengths)])
+
+
+def _near_faces(plane: Plane, mesh: Mesh, reach: float) -> NDArray[np.int64]:
+    """Returns the triangles [K, 3] of the mesh within `reach` of a plane, of any direction."""
+    return np.asarray(mesh.faces[(np.abs(plane.heights(mesh.vertices)) < reach)[mesh.faces].all(1)])
 
 
 def _grid(plane: Plane, points: NDArray[np.float64], cell: float) -> _Grid | None:
