@@ -26,7 +26,9 @@ from recon_cli.room.texture_kernels import draw
 from recon_cli.scene.camera import Camera
 
 _BAND = 2.0  # voxels, within which surface belongs to a plane
+_NEAR = 6.0  # voxels, within which a bump is not a hole
 _LEAST_COSINE = 0.8  # between its normal and that of the plane
+_ACROSS = 0.2  # cosine between planes that meet, at most
 _CLOSED = 2  # cells of a gap in what surrounds a hole
 _REACH = 3.0  # cells, from a plane to the surface of another one that meets it
 _AGREE = 0.05  # of a depth, within which a view shows the plane, not what lies behind it
@@ -83,8 +85,11 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
     planes = find_planes(centers, normals, areas, _BAND * voxel)
     views = _look(maps, mesh)
     vertices, faces, count = [], [], 0
-    for plane in planes:
-        found = _close(plane, planes, mesh, views, voxel)
+    sheets = [(plane, mesh.vertices[_own_faces(plane, mesh, voxel)]) for plane in planes]
+    for number, (plane, own) in enumerate(sheets):
+        others = [*sheets[:number], *sheets[number + 1:]]
+        near = mesh.vertices[_near_faces(plane, mesh, _NEAR * voxel)]
+        found = _close(plane, own, near, others, views, voxel) if len(own) else None
         if found is not None:
             vertices.append(found[0])
             faces.append(found[1] + count)
@@ -104,19 +109,22 @@ def _look(maps: DepthMaps, mesh: Mesh) -> list[_Look]:
 
 
 def _close(
-    plane: Plane, planes: Sequence[Plane], mesh: Mesh, views: Sequence[_Look], voxel: float
+    plane: Plane, own: NDArray[np.float64], near: NDArray[np.float64],
+    others: Sequence[tuple[Plane, NDArray[np.float64]]], views: Sequence[_Look], voxel: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """Returns vertices and triangles that close the holes of a plane; None if it has none."""
-    own = _own_faces(plane, mesh, voxel)
-    if not len(own):
-        return None
-    grid = _grid(plane, mesh.vertices[own].reshape(-1, 3), voxel)
+    """Returns vertices and triangles that close the holes of a plane; None if it has none.
+
+    `own` and the second of each of the `others` are triangles in the planes, as corners [K, 3, 3].
+    `near` are all beside this one: bumps of it, which are not holes.
+    """
+    grid = _grid(plane, own.reshape(-1, 3), voxel)
     if grid is None:
         return None
-    heights = _heights(grid, mesh.vertices[own])
+    heights = _heights(grid, own)
     confirmed = np.isfinite(heights)
-    meets, beyond = _edges(grid, plane, planes, mesh, voxel)
+    meets, beyond = _edges(grid, plane, others)
     holes = binary_fill_holes(_pad_close(confirmed | meets)) & ~confirmed & ~beyond
+    holes &= ~np.isfinite(_heights(grid, near))
     rows, columns = np.nonzero(holes)
     if not len(rows):
         return None
@@ -135,6 +143,11 @@ def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
     near = np.abs(corners @ plane.normal - plane.offset).max(axis=1) < _BAND * voxel
     return np.asarray(mesh.faces[near & (normals @ plane.normal > _LEAST_COSINE * lengths)])
+
+
+def _near_faces(plane: Plane, mesh: Mesh, reach: float) -> NDArray[np.int64]:
+    """Returns the triangles [K, 3] of the mesh within `reach` of a plane, of any direction."""
+    return np.asarray(mesh.faces[(np.abs(plane.heights(mesh.vertices)) < reach)[mesh.faces].all(1)])
 
 
 def _grid(plane: Plane, points: NDArray[np.float64], cell: float) -> _Grid | None:
@@ -159,18 +172,15 @@ def _heights(grid: _Grid, corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _edges(
-    grid: _Grid, plane: Plane, planes: Sequence[Plane], mesh: Mesh, voxel: float
+    grid: _Grid, plane: Plane, others: Sequence[tuple[Plane, NDArray[np.float64]]]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Returns the cells where surface of other planes meets this one, and those behind it."""
     meets, beyond = np.zeros((2, *grid.shape), bool)
     shift = 0.5 * grid.cell
-    for other in planes:
-        if other is plane or abs(float(other.normal @ plane.normal)) > 1 - _LEAST_COSINE:
+    for other, triangles in others:
+        if abs(float(other.normal @ plane.normal)) > _ACROSS:
             continue
-        faces = _own_faces(other, mesh, voxel)
-        if not len(faces):
-            continue
-        local = grid.local(mesh.vertices[faces].mean(axis=1))
+        local = grid.local(triangles.mean(axis=1))
         local = local[np.abs(local[:, 2]) < _REACH * grid.cell]
         column, row = np.floor(local[:, :2]).astype(int).T
         inside = (row >= 0) & (column >= 0) & (row < grid.shape[0]) & (column < grid.shape[1])

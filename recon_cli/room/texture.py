@@ -27,7 +27,7 @@ from recon_cli.stereo.depths import camera_row
 _SHARPER = 4.0  # exponent of how sharp a view is, in its weight
 _CORRECTIONS = 2  # by what the texture misses of the photos
 STEPS = 1 + _CORRECTIONS  # of each view
-_OFFSET, _STEP = 128.0, 2.0  # levels, of what a byte says that is missed
+_OFFSET, _STEP = 128, 2.0  # of bytes that say what is missed: no error, and levels of a step
 _SMALLEST = 256  # texels, of the last half
 MOST_PIXELS = 50_000_000  # of all photos; 11 bytes of each are in memory
 _TOLERANCE = 0.025  # of a depth, within which a view shows a texel
@@ -77,8 +77,14 @@ def add_texture(
         image = paint(mesh.vertices, normals, mesh.colors, mesh.faces, charts, views, size,
                       bar.advance)
     marks = None if mesh.inferred is None else mesh.inferred[charts.rows]
-    return Mesh(mesh.vertices[charts.rows], charts.faces, mesh.colors[charts.rows], marks,
-                Texture(image, charts.corners / size, kind))
+    # vertices of inferred surface come last, as in files
+    order = np.argsort(np.zeros(len(charts.rows)) if marks is None else marks, kind="stable")
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    rows = charts.rows[order]
+    return Mesh(
+        mesh.vertices[rows], place[charts.faces], mesh.colors[rows],
+        None if marks is None else marks[order], Texture(image, charts.corners[order] / size, kind))
 
 
 def paint(
@@ -98,7 +104,7 @@ def paint(
         on_step: called `STEPS` times for each view.
 
     The mean over all views is blurred by their pixels and by what the mesh misses. Twice what each
-    photo shows besides it is added, as in back-projection (Irani and Peleg 1991).
+    photo shows besides it is added, as in back-projection (Irani and Peleg 1991), at half the size.
     """
     drawn = []
     for view in views:
@@ -109,34 +115,34 @@ def paint(
     nearness = np.concatenate([one.nearness.reshape(-1) for one in drawn])
     quality = np.concatenate([usable(one.nearness, view.mask).reshape(-1)
                               for view, one in zip(views, drawn, strict=True)])
-    texture = np.zeros((size, size, 3), np.float32)
-    covered = np.zeros((size, size), np.uint8)
     places, outward = vertices[charts.rows], normals[charts.rows]
 
-    def add(
-        pixels: NDArray[np.uint8], table: NDArray[np.float64], unseen: NDArray[np.float32],
-        offset: float, scale: float,
+    def mean(
+        images: Sequence[NDArray[np.uint8]], table: NDArray[np.float64],
+        unseen: NDArray[np.uint8], side: int,
     ) -> NDArray[np.uint8]:
-        pool.run(bake, places, outward, unseen, charts.faces, charts.corners, table,
-                 starts.astype(np.int64), pixels, nearness, quality, _TOLERANCE, offset, scale,
-                 texture, covered)
-        return fill_gaps(np.asarray(cv2.convertScaleAbs(texture.clip(0)), np.uint8), covered > 0)
+        """Returns the texture [side, side, 3] of images of the views."""
+        texture = np.zeros((side, side, 3), np.uint8)
+        covered = np.zeros((side, side), np.uint8)
+        pixels = np.concatenate([image.reshape(-1, 3) for image in images])
+        pool.run(bake, places, outward, unseen, charts.faces, charts.corners * (side / size), table,
+                 starts.astype(np.int64), pixels, nearness, quality, _TOLERANCE, texture, covered)
+        return fill_gaps(texture, covered > 0)
 
-    photos = np.concatenate([view.image.reshape(-1, 3) for view in views])
-    painted = add(photos, table, colors[charts.rows].astype(np.float32), 0.0, 1.0)
-    nothing = np.full((len(places), 3), _OFFSET, np.float32)
-    even = table.copy()
+    painted = mean([view.image for view in views], table, colors[charts.rows], size)
+    nothing, even = np.full((len(places), 3), _OFFSET, np.uint8), table.copy()
     even[:, GAIN:] = 1
     for _ in range(_CORRECTIONS):
-        missed = []
-        levels = halve(painted)
+        levels, missed = halve(painted), []
         for view, one, row in zip(views, drawn, table, strict=True):
             image = view.image * row[GAIN:].astype(np.float32)
             error = image - shade_mesh(row, places, charts, one, levels, image)
-            missed.append(np.clip(np.rint(error / _STEP + _OFFSET), 0, 255).astype(
-                np.uint8).reshape(-1, 3))
+            missed.append(np.clip(np.rint(error / _STEP + _OFFSET), 0, 255).astype(np.uint8))
             on_step()
-        painted = add(np.concatenate(missed), even, nothing, _OFFSET, _STEP)
+        half = mean(missed, even, nothing, max(1, size // 2))
+        whole = cv2.resize(half, (size, size), interpolation=cv2.INTER_LINEAR)
+        painted = np.asarray(cv2.addWeighted(
+            painted, 1.0, whole, _STEP, -_STEP * _OFFSET), np.uint8)
     return painted
 
 

@@ -69,13 +69,13 @@ def draw(counter, places, faces, nearness, owners):
 
 @kernel
 def bake(counter, vertices, normals, colors, faces, corners, views, starts, pixels, nearness,
-         quality, tolerance, offset, scale, texture, covered, scratch):
-    """Adds to the texels of all triangles what the views show there.
+         quality, tolerance, texture, covered, scratch):
+    """Paints the texels of all triangles with what the views show there.
 
     Args:
         counter: [1] shared; triangles already taken.
         vertices: [V, 3] float64; normals: [V, 3] float64 unit vectors, outwards.
-        colors: [V, 3] float32, taken where no view shows a texel.
+        colors: [V, 3] uint8, taken where no view shows a texel.
         faces: [F, 3] int64.
         corners: [V, 2] float64 column and row in the texture, in texels.
         views: [C, COLUMNS] float64.
@@ -83,8 +83,7 @@ def bake(counter, vertices, normals, colors, faces, corners, views, starts, pixe
         pixels: [P, 3] uint8; nearness: [P] float32, 1 / depth of the mesh, 0 for nothing.
         quality: [P] uint8, how well a pixel may be used, 0 where it may not.
         tolerance: of a depth, within which a view shows a texel.
-        offset, scale: a value counts as scale * (value - offset).
-        texture: [T, T, 3] float32 in and out.
+        texture: [T, T, 3] uint8 out.
         covered: [T, T] uint8 out: 1 painted from views, 2 from `colors`.
 
     A texel is the mean of the views that show it, weighted by the pixels that they have for an area
@@ -182,9 +181,9 @@ def bake(counter, vertices, normals, colors, faces, corners, views, starts, pixe
                         red = wa * colors[a, 0] + wb * colors[b, 0] + wc * colors[c, 0]
                         green = wa * colors[a, 1] + wb * colors[b, 1] + wc * colors[c, 1]
                         blue = wa * colors[a, 2] + wb * colors[b, 2] + wc * colors[c, 2]
-                    texture[y, x, 0] += scale * (red - offset)
-                    texture[y, x, 1] += scale * (green - offset)
-                    texture[y, x, 2] += scale * (blue - offset)
+                    texture[y, x, 0] = min(255.0, red + 0.5)
+                    texture[y, x, 1] = min(255.0, green + 0.5)
+                    texture[y, x, 2] = min(255.0, blue + 0.5)
 
 
 @inlined

@@ -83,10 +83,10 @@ def main(workspace: Path, threads: int, size: int, kept: Path | None) -> None:
         shown = drawn.owners >= 0
         counts = np.ones(shown.sum(), bool) if view.mask is None else view.mask[shown]
         truth = view.image[shown].astype(np.float64)
-        pictures = (vertex_colors(mesh, view.camera, drawn),
-                    texture_colors(textured, view.camera, drawn))
+        both = (vertex_colors(mesh, view.camera, drawn),
+                texture_colors(textured, view.camera, drawn))
         scores.append([10 * np.log10(255**2 / ((colors - truth)[counts] ** 2).mean())
-                       for colors in pictures])
+                       for colors in both])
     by_vertex, by_texture = np.mean(scores, axis=0)
     print_head("views", "vertex colours, dB", "texture, dB", "gain", "least", "CPU s", "peak MB")
     least = min(float(other - one) for one, other in scores)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon_cli.io.mesh_data import Mesh
+from recon_cli.io.mesh_data import Mesh, joined
 from recon_cli.progress import NullProgress
 from recon_cli.room import texture
 from recon_cli.room.charts import make_charts
+from recon_cli.room.files import write_mesh_file
 from recon_cli.room.texture import add_texture, draw_mesh, fill_gaps, halve, shade_mesh, usable
 from recon_cli.room.texture_kernels import COLUMNS, WEIGHT
 from recon_cli.room.volume import pixel_rays
@@ -172,3 +173,17 @@ def test_charts_keep_every_triangle_and_lie_apart():
         hits += (np.min(sides, axis=0) > 0.5) | (np.max(sides, axis=0) < -0.5)
     assert hits.max() == 1
     assert hits.sum() > 0.3 * 256**2
+
+
+def test_inferred_surface_keeps_its_mark_and_comes_last_as_in_files(tmp_path):
+    one, other = wall(), wall()
+    moved = Mesh(other.vertices + np.array([0, 1.7, 0]), other.faces, other.colors,
+                 np.ones(len(other.vertices), bool))
+    both = joined(one, moved)
+    views = [TrainView(view, photo(view)) for view in CAMERAS]
+    mesh = add_texture(both, views, 128, "png", NullProgress())
+    assert np.array_equal(mesh.vertices[mesh.faces], both.vertices[both.faces])
+    assert np.array_equal(mesh.inferred, mesh.vertices[:, 1] > 0.85)
+    assert (np.diff(mesh.inferred.astype(int)) >= 0).all()
+    for suffix in ("glb", "obj"):
+        write_mesh_file(tmp_path / f"mesh.{suffix}", mesh, UP)  # reads it back
