@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from recon_cli.io.colmap import read_scene
+from recon_cli.scene.motion import Moment
 from recon_cli.scene.scene import Scene
 from recon_cli.workspace.records import read_frame_list
 from recon_cli.workspace.summaries import WorldSummary
@@ -32,4 +33,7 @@ def load_scene(
         sfm / "undistorted", held_out=held_out, validation=validation, sparse=sparse)
     world = WorldSummary.read(sfm)
     up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
-    return dataclasses.replace(scene, up=up)
+    moments = {
+        frame.name: Moment(frame.source, frame.time_seconds)
+        for frame in read_frame_list(folders["ingest"]).frames if frame.time_seconds is not None}
+    return dataclasses.replace(scene, up=up, moments=moments)

@@ -23,12 +23,15 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
+from recon_cli.scene.motion import Motion
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.background import FarContent, faces, far_content, look_at_one_thing
 from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
+from recon_cli.train.motion_blur import blurred_psnr
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.shutter import BlurEvidence
 from recon_cli.train.task import Task
 from recon_cli.workspace.summaries import TrialDecision
 
@@ -107,18 +110,22 @@ def split(training: int, validation: int) -> Split | None:
     return Split(train, held_out, own=True)
 
 
+_BLUR_SIDE = 300  # pixels of the longer side in the trial of blur, which is gone at LEVEL
+# Times the shutter time of edges 2 pixels wide. 2.8 in a room that was blurred by a known time: its
+# edges are softer.
+SHUTTERS = 1.25, 2.5
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
 _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
-PARTS = ("far", "stereo", "exposure", "images")
+PARTS = ("far", "stereo", "exposure", "images", "blur")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
     """Returns the parts of the model that trials decide on, by the names of their options."""
-    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
+    return {name: getattr(config, name) for name in (*PARTS, "shutter", "sh_degree")}
 
 
 @dataclass(frozen=True)
@@ -170,9 +177,21 @@ def examine(scene: TrialScene) -> Needs:
         settle("images", "denoised", "")
     settle("far", "on" if bench.far.share > 0 else None, "points cover all that the views see")
     drift = bench.drift
+    if config.look == "even" and config.exposure == "auto":
+        decisions.append(TrialDecision(
+            name="exposure", on=drift.drifts, mean_db=None, standard_error_db=None, seconds=0.0,
+            reason="one exposure for all is asked for, and brightness of the same points differs "
+            f"by {100 * drift.spread:.1f}%"))
+        config = replace(config, exposure=_word("exposure", on=drift.drifts))
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
+    if config.blur != "off":
+        blur = bench.blur
+        if config.shutter is None:
+            config = replace(config, shutter=bench.shutter(config))
+        settle("blur", "on" if blur.speaks else None,
+               "the motion of the camera does not tell which views are blurred")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
     return Needs(config, tuple(decisions))
@@ -200,7 +219,28 @@ class _Bench:
         drifting = task.schedule.config.exposure != "off"
         self.drift = (estimate_gains(task.train, scene.points) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))
+        self.blur = (task.motions.find_blur(task.train)
+                     if task.motions is not None and task.schedule.config.blur != "off"
+                     else BlurEvidence.nothing())
         self._scores: dict[tuple[object, ...], list[float]] = {}
+
+    def shutter(self, config: RunConfig) -> float | None:
+        """Returns the shutter time in seconds that explains views best; None without evidence.
+
+        Without views to try it on, that of the evidence.
+        """
+        if self.blur.seconds == 0 or not (self.blur.speaks or config.blur == "on"):
+            return None
+        times = [factor * self.blur.seconds for factor in SHUTTERS]
+        if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
+            return times[0]
+        return max(times, key=lambda time: float(np.mean(self._run(
+            replace(config, blur="on", shutter=time), self._blur_level))))
+
+    @property
+    def _blur_level(self) -> int:
+        camera = self._scene.task.train[0].camera
+        return max(1, round(max(camera.width, camera.height) / _BLUR_SIDE))
 
     def try_part(self, part: str, config: RunConfig, value: str) -> TrialDecision:
         """Returns whether a part pays on top of those that are on already."""
@@ -212,7 +252,7 @@ class _Bench:
             return skip_trial(part, "too few of the views to score see any of it")
 
         def scores(config: RunConfig) -> list[float]:
-            values = self._run(config)
+            values = self._run(config, self._blur_level if part == "blur" else LEVEL)
             return [values[i] for i in telling]
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
@@ -251,19 +291,19 @@ class _Bench:
         held_out = task.train if chosen.own else task.validation
         return chosen.train, [held_out[i] for i in chosen.held_out]
 
-    def _run(self, config: RunConfig) -> list[float]:
+    def _run(self, config: RunConfig, level: int = LEVEL) -> list[float]:
         """Returns the corrected PSNR in dB of each held-out view after a short run."""
         for part in PARTS:
             if getattr(config, part) == "auto":
                 config = _with(config, part, _word(part, on=False))
-        key = (config.sh_degree, *(getattr(config, part) for part in PARTS))
+        key = (level, *model_parts(config).values())
         if key not in self._scores:
             self._scores[key] = self._train(replace(
                 config, iterations=_STEPS, max_gaussians=min(config.max_gaussians, _CAP),
-                early_stop=False, batch_views=1))
+                early_stop=False, batch_views=1), level)
         return self._scores[key]
 
-    def _train(self, config: RunConfig) -> list[float]:
+    def _train(self, config: RunConfig, level: int) -> list[float]:
         scene, task = self._scene, self._scene.task
         train = task.train
         if scene.twins is not None and config.images == "denoised":
@@ -275,10 +315,24 @@ class _Bench:
         recipe = dataclasses.replace(recipe, levels=(), replaced_at_once=0.0,
                                      means_rate=_FURTHER * recipe.means_rate)
         schedule = Schedule(config, recipe)
-        small = Task([reduce_view(train[i], LEVEL) for i in rows], [], schedule, task.extent,
-                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
+        motions = task.motions and task.motions.select(rows)
+        small = Task([reduce_view(train[i], level) for i in rows], [], schedule, task.extent,
+                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo,
+                     motions=motions)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, _STEPS)
-        return [mean_psnr(state.splats, [reduce_view(view, LEVEL)], config.sh_degree, task.backend,
-                          corrected=True) for view in held_out]
+        return [mean_psnr(state.splats, [reduce_view(view, level)], config.sh_degree, task.backend,
+                          corrected=True) if motion is None else
+                blurred_psnr(state.splats, reduce_view(view, level), motion, small)
+                for view, motion in zip(held_out, self._held_out_motions(config), strict=True)]
+
+    def _held_out_motions(self, config: RunConfig) -> Sequence[Motion | None]:
+        """Returns the motions of the views to score; None for those that are scored as sharp."""
+        task = self._scene.task
+        chosen = split(len(task.train), len(task.validation))
+        assert chosen is not None
+        if config.blur != "on" or task.motions is None:
+            return [None] * len(chosen.held_out)
+        motions = task.motions.train if chosen.own else task.motions.validation
+        return [motions[i] for i in chosen.held_out]

@@ -37,6 +37,14 @@ def test_a_camera_that_sets_its_exposure_is_found_and_helped():
     assert needs.config.exposure == "on"
 
 
+def test_one_exposure_for_all_needs_no_trial_but_a_drift():
+    config = replace(CONFIG, look="even", far="off")
+    even, plain = examine(scene(drift=0.15, config=config)), examine(scene(config=config))
+    assert (even.config.exposure, plain.config.exposure) == ("on", "off")
+    assert even.seconds == 0
+    assert reasons(even)["exposure"].startswith("one exposure")
+
+
 def test_surfaces_by_stereo_are_used_without_a_trial():
     needs = examine(scene())
     assert needs.config.stereo == "on"
