@@ -26,6 +26,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.motion import Motion
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.background import project_points
 from recon_cli.train.gradient import GradientStep, photometric_loss
 from recon_cli.train.optimizer import SplatOptimizer
 from recon_cli.train.shutter import ViewMotions, median_speed
@@ -35,6 +36,10 @@ _GAMMA = 2.2
 _LIFT = 1 / 255  # added while light is summed: the slope of the root has no end at black
 _LEAST = 1.0  # pixels of blur; less is within the width of an edge
 _FEWEST, _MOST = 3, 5  # cameras along a way
+# Of views that leave training: times the median blur, and pixels; and how many views of the median
+# blur or less must show how much of their points
+_MUCH, _SHARP_VIEWS, _SHOWN = 3.0, 3, 0.95
+_POINTS = 4000  # looked at for that
 _APART = 3.0  # pixels from one to the next, if that many are enough
 
 
@@ -75,6 +80,28 @@ def _blur_of(task: Task) -> tuple[ViewMotions, float]:
     return task.motions, seconds
 
 
+def turn_chances(task: Task) -> Tensor:
+    """Returns the chance [F] of each training view to have a turn in an epoch with blur.
+
+    1 for views of the median blur or less; others have the fewer turns, the more pixels they are
+    blurred by. One that is much more blurred has none if sharp views show what it shows.
+    """
+    motions, seconds = _blur_of(task)
+    pixels = np.array([
+        0.0 if motion is None else seconds * median_speed(view.camera, motion, motions.points)
+        for view, motion in zip(task.train, motions.train, strict=True)])
+    chances = np.minimum(1.0, (1 + np.median(pixels)) / (1 + pixels))
+    chosen = motions.points[:: max(1, len(motions.points) // _POINTS)]
+    shown = np.zeros((len(pixels), len(chosen)), bool)
+    for seen, view in zip(shown, task.train, strict=True):
+        seen[project_points(view.camera, chosen)[0]] = True
+    known = shown[chances == 1].sum(axis=0) >= _SHARP_VIEWS
+    for row in np.flatnonzero(pixels > max(_MUCH * float(np.median(pixels)), _MUCH)):
+        if shown[row].any() and known[shown[row]].mean() >= _SHOWN:
+            chances[row] = 0.0
+    return torch.from_numpy(chances)
+
+
 class BlurredSteps:
     """Chooses for each step of a run how its view is compared: as it is, or blurred."""
 
@@ -83,6 +110,14 @@ class BlurredSteps:
         self._blur = _blur_of(task) if task.schedule.config.blur == "on" else None
         self._blurred = _BlurredStep(task.backend, plain)
         self._speeds: dict[int, float] = {}  # pixels/s at the width of 1
+        self._chances = None if self._blur is None else turn_chances(task)
+
+    def draw(self, order: Tensor, generator: torch.Generator, iteration: int) -> Tensor:
+        """Returns which views have a turn in an epoch that begins with this step, of an order."""
+        if self._chances is None or not self._schedule.blurs(iteration):
+            return order
+        drawn = torch.rand(len(order), generator=generator, dtype=torch.float64)
+        return order[drawn < self._chances[order]]
 
     def choose(self, view: TrainView, index: int, iteration: int) -> GradientStep:
         """Returns the step for a training view, reduced or not, by its index."""

@@ -54,7 +54,8 @@ class Stepper:
         """
         state, task = self._state, self._task
         iteration = state.iteration + 1
-        batch = [next_view(state, task) for _ in range(task.schedule.config.batch_views)]
+        batch = [next_view(state, task, self._blurred)
+                 for _ in range(task.schedule.config.batch_views)]
         result = self._gather(batch, iteration)
         state.iteration = iteration
         loss = float(result.loss.mean())
@@ -131,10 +132,12 @@ class Stepper:
             factor=schedule.rate_factor(iteration))
 
 
-def next_view(state: TrainState, task: Task) -> int:
+def next_view(state: TrainState, task: Task, blurred: BlurredSteps | None = None) -> int:
     """Returns the view whose turn it is; every epoch has an order of its own."""
-    if not state.queue:
-        state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
+    while not state.queue:
+        order = torch.randperm(len(task.train), generator=state.generator)
+        state.queue = (order if blurred is None else blurred.draw(
+            order, state.generator, state.iteration + 1)).tolist()
     return state.queue.pop()
 
 

@@ -20,7 +20,12 @@ from recon_cli.train import initialize
 from recon_cli.train.feature_trials import examine
 from recon_cli.train.fit import fit
 from recon_cli.train.gradient import gradient_step, photometric_loss
-from recon_cli.train.motion_blur import BlurredSteps, cameras_along, mean_light
+from recon_cli.train.motion_blur import (
+    BlurredSteps,
+    cameras_along,
+    mean_light,
+    turn_chances,
+)
 from recon_cli.train.schedule import Schedule, make_schedule
 from recon_cli.train.shutter import ViewMotions
 from recon_cli.train.state import new_state
@@ -116,6 +121,35 @@ def test_an_interrupted_run_ends_with_the_same_bytes(tmp_path):
     plain = first_state(BLURRED, backend="numba")
     fit(plain, replace(task, schedule=Schedule(CONFIG)), 60)
     assert not same(whole, plain)
+
+
+def test_sharp_views_have_more_turns_and_much_blurred_ones_none_where_others_see_the_same():
+    task = tiny_task(BLURRED)
+    slow, fast, wild = (
+        Motion(np.zeros(3), np.array([speed, 0, 0])) for speed in (0.05, 0.3, 9.0))
+    train = [task.train[0]] * 6
+    task = replace(task, train=train, motions=ViewMotions(
+        (slow, slow, slow, slow, fast, wild), (), POINTS))
+    chances = turn_chances(task).numpy()
+    assert (chances[:4] == 1).all()
+    assert 0.2 < chances[4] < 1
+    assert chances[5] == 0
+    alone = replace(task.train[0].camera, viewmat=np.diag([-1.0, 1, -1, 1]))
+    behind = np.concatenate([POINTS, POINTS * [1, 1, -1]])  # what it alone shows
+    turned = replace(
+        task, train=[*train[:5], replace(train[0], camera=alone)],
+        motions=replace(task.motions, points=behind))
+    assert 0 < turn_chances(turned).numpy()[5] < 1
+
+
+def test_an_epoch_without_blur_has_every_view_once():
+    task = blurred_task(CONFIG)
+    steps = BlurredSteps(task, gradient_step("torch"))
+    generator = torch.Generator().manual_seed(0)
+    state = generator.get_state()
+    order = torch.arange(4)
+    assert torch.equal(steps.draw(order, generator, 60), order)
+    assert torch.equal(generator.get_state(), state), "no number is drawn"
 
 
 def test_blur_without_motion_or_time_is_refused():
