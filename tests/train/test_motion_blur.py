@@ -161,7 +161,7 @@ def test_blur_without_motion_or_time_is_refused():
     assert "--shutter" in caught.value.hint
 
 
-@pytest.mark.integration
+@pytest.mark.slow
 def test_a_trial_finds_blur_and_the_run_leaves_it_out_of_the_scene():
     made = scene()
     config = replace(made.task.schedule.config, far="off", exposure="off", stereo="off")
