@@ -52,7 +52,7 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 
 def test_what_the_options_say_is_not_tried():
-    config = replace(CONFIG, far="off", stereo="on", exposure="on")
+    config = replace(CONFIG, far="off", stereo="on", exposure="on", blur="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config
