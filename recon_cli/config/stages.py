@@ -219,7 +219,7 @@ class TrainConfig(StageConfig):
         "out; auto: on.",
         choices=("auto", "on", "off"), expert=True)
     exposure: str = option(
-        "auto", "Fit a gain per image and channel; auto: if a trial improves validation PSNR.",
+        "auto", "A gain per image; auto: by trial.",
         choices=("auto", "on", "off"))
     depth: str = option(
         "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
@@ -228,6 +228,16 @@ class TrainConfig(StageConfig):
     moving: str = option(
         "auto", "Mask people and things that move; auto: where views contradict the others.",
         choices=("auto", "on", "off"), late=True, expert=True)
+    look: str = option(
+        "walk", "Brightness: as filmed, or even.", choices=("walk", "even"),
+        late=True)
+    blur: str = option(
+        "auto", "Compare blurred views with renders that are blurred by the camera's way, so that "
+        "the scene is sharp; auto: by a trial.",
+        choices=("auto", "on", "off"), expert=True, late=True)
+    shutter: float | None = option(
+        None, "Time for which the shutter was open, for --blur.", unit="seconds", minimum=1e-5,
+        automatic="by a trial", expert=True, late=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,

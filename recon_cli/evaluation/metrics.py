@@ -18,6 +18,9 @@ from recon_cli.scene.train_view import BORDER, MIN_SIDE, without_border
 from recon_cli.workspace.digests import digest_file
 
 PSNR_CONVENTION = "mean of per-image dB, float render clamped to [0, 1] against 8-bit truth"
+GAIN_CONVENTION = (
+    "the same after the factor of each view and channel that fits its truth best, as the exposure "
+    "of a view that was not trained on is not known")
 PSNR_8BIT_CONVENTION = "the same of the render rounded to 8 bits, as a picture file holds it"
 SSIM_CONVENTION = (
     "scikit-image: 11x11 Gaussian window, sigma 1.5, 5 px border cropped, mean of channels")
@@ -33,8 +36,8 @@ CONVENTIONS: dict[str, Any] = {  # as JSON files hold them
     "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
     "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION}
 CONVENTION_LINES = (  # below tables
-    f"PSNR: {PSNR_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\nSSIM: {SSIM_CONVENTION}\n"
-    f"SSIM 0-pad: {SSIM_PADDED_CONVENTION}\n")
+    f"PSNR: {PSNR_CONVENTION}\nafter gain: {GAIN_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\n"
+    f"SSIM: {SSIM_CONVENTION}\nSSIM 0-pad: {SSIM_PADDED_CONVENTION}\n")
 _MAX_DB = 100.0  # of equal images, which JSON cannot hold
 _LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them: ends in their SHA-256
 _LPIPS_ADDRESS = f"https://download.pytorch.org/models/{_LPIPS_WEIGHTS}"

@@ -7,7 +7,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,8 +37,6 @@ class RenderScores:
     """The scores of one model on reference views."""
 
     views: tuple[ViewScore, ...]
-    # Mean PSNR after the best gain per channel of each view, whose exposure is unknown.
-    corrected_db: float
     render_ms: float  # median milliseconds a view
 
 
@@ -127,8 +125,8 @@ def score_views(
         splats, views, sh_degree, backend, score, threads=threads, milliseconds=milliseconds)
     rows = [row for row in found if not isinstance(row, FaceScore)]
     rows += join_faces([row for row in found if isinstance(row, FaceScore)])
-    scores, corrected = zip(*rows, strict=True)
-    return RenderScores(scores, statistics.fmean(corrected), statistics.median(milliseconds))
+    scores = tuple(replace(score, gain_psnr_db=corrected) for score, corrected in rows)
+    return RenderScores(scores, statistics.median(milliseconds))
 
 
 def mean_psnr(

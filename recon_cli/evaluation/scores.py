@@ -20,7 +20,7 @@ _TEX = str.maketrans({
     "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"})
 REFERENCE = "3DGS"  # the recipe of Kerbl et al. 2023
-_VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips")
+_VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips", "gain_psnr_db")
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class ViewScore(JsonRecord):
     ssim: float  # by scikit-image
     ssim_padded: float  # by INRIA's convention
     lpips: float | None = None  # None where it was not measured
+    gain_psnr_db: float | None = None  # after its best gain per channel; None in older files
     pixels_scored: float | None = None  # fraction that a mask leaves; None without a mask
 
 
@@ -57,7 +58,9 @@ class ModelMetrics(JsonRecord):
     bytes: int  # of its file
     render_ms: float  # median milliseconds a view
     train_seconds: float | None  # of training that led to it; None where unknown
-    gain_psnr_db: float | None = None  # after the best gain of each view, with --exposure
+    gain_psnr_db: float | None = None  # after the best gain per channel of each view
+    # whether `seen_psnr_db` is after gains, too; None in older files: where gain_psnr_db is there
+    seen_after_gains: bool | None = None
     seen_psnr_db: Mapping[str, float] = field(default_factory=dict)  # on training views, by split
     # beside what moves in the held-out views, where training masked what moves
     static_psnr_db: float | None = None
@@ -77,19 +80,27 @@ class ModelMetrics(JsonRecord):
     @classmethod
     def from_views(
         cls, views: tuple[ViewScore, ...], *, gaussians: int, bytes: int, render_ms: float,
-        train_seconds: float | None = None, gain_psnr_db: float | None = None,
+        train_seconds: float | None = None, seen_after_gains: bool = False,
         seen_psnr_db: Mapping[str, float] | None = None, static_psnr_db: float | None = None,
     ) -> Self:
         """Returns the scores of a model from those of its views."""
         psnr_db, psnr_8bit_db, ssim, ssim_padded = (
             float(np.mean([getattr(view, name) for view in views])) for name in _VIEW_FIELDS[:4])
-        lpips = [view.lpips for view in views if view.lpips is not None]
+        lpips, gained = ([value for view in views if (value := getattr(view, name)) is not None]
+                         for name in ("lpips", "gain_psnr_db"))
         return cls(
             psnr_db=psnr_db, psnr_8bit_db=psnr_8bit_db, ssim=ssim, ssim_padded=ssim_padded,
             lpips=float(np.mean(lpips)) if len(lpips) == len(views) else None,
             gaussians=gaussians, bytes=bytes, render_ms=render_ms, train_seconds=train_seconds,
-            gain_psnr_db=gain_psnr_db, seen_psnr_db=seen_psnr_db or {},
+            gain_psnr_db=float(np.mean(gained)) if len(gained) == len(views) else None,
+            seen_after_gains=seen_after_gains, seen_psnr_db=seen_psnr_db or {},
             static_psnr_db=static_psnr_db, views=views)
+
+    @property
+    def gap_psnr_db(self) -> float:
+        """PSNR of the held-out views that compares with `seen_psnr_db`."""
+        after = self.seen_after_gains is not False and self.gain_psnr_db is not None
+        return self.gain_psnr_db if after and self.gain_psnr_db is not None else self.psnr_db
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,10 +277,12 @@ def model_table(
     """
     rows = {**models, **(means or {})}
     perceptual = any(model.lpips is not None for model in rows.values())
-    headings = ("model", "PSNR dB", "8-bit", "SSIM", "SSIM 0-pad", *["LPIPS"] * perceptual,
-                "Gaussians", "MB", "ms/view", "train s")
+    gains = any(model.gain_psnr_db is not None for model in rows.values())
+    headings = ("model", "PSNR dB", *["after gain"] * gains, "8-bit", "SSIM", "SSIM 0-pad",
+                *["LPIPS"] * perceptual, "Gaussians", "MB", "ms/view", "train s")
     return Table(headings, tuple((
-        label, f"{model.psnr_db:.2f}", f"{model.psnr_8bit_db:.2f}", f"{model.ssim:.4f}",
+        label, f"{model.psnr_db:.2f}", *[or_dash(model.gain_psnr_db, ".2f")] * gains,
+        f"{model.psnr_8bit_db:.2f}", f"{model.ssim:.4f}",
         f"{model.ssim_padded:.4f}", *[or_dash(model.lpips, ".4f")] * perceptual,
         f"{model.gaussians:,}", f"{model.bytes / 1e6:.1f}", f"{model.render_ms:.0f}",
         or_dash(model.train_seconds, ".0f")) for label, model in rows.items()),

@@ -106,7 +106,7 @@ def _gap_table(models: Mapping[str, ModelMetrics]) -> Table:
     """Returns PSNR by split; the last column shows how far the model overfits."""
     rows = []
     for key, model in models.items():
-        held_out = model.psnr_db if model.gain_psnr_db is None else model.gain_psnr_db
+        held_out = model.gap_psnr_db
         training, validation = map(model.seen_psnr_db.get, ("training", "validation"))
         gap = None if training is None else training - held_out
         rows.append((MODEL_LABELS[key], or_dash(training, ".2f"), or_dash(validation, ".2f"),

@@ -125,7 +125,7 @@ class _Evaluation:
         return ModelMetrics.from_views(
             scores.views, gaussians=len(splats), bytes=path.stat().st_size,
             render_ms=scores.render_ms, train_seconds=seconds,
-            gain_psnr_db=scores.corrected_db if self.gains else None, seen_psnr_db=seen_db,
+            seen_after_gains=self.gains, seen_psnr_db=seen_db,
             static_psnr_db=float(np.mean(static)) if static else None)
 
     def _static(self, view: ReferenceView) -> NDArray[np.bool_] | None:
@@ -199,7 +199,7 @@ def run(
     for name, model in models.items():
         for key in ("psnr_db", "ssim", "gaussians"):
             means[f"{name}_{key}"] = round(getattr(model, key), 4)
-        if model.gain_psnr_db is not None:
+        if evaluation.gains and model.gain_psnr_db is not None:
             means[f"{name}_gain_psnr_db"] = round(model.gain_psnr_db, 4)
     exported, folder = list(evaluation.folders.items())[-1]  # the pruned model, if there is one
     trust = assess(TrustTask(
@@ -297,9 +297,6 @@ def _write(
         stretches = describe_stretches(evaluation.frames, metrics.unregistered or ())
         note += f"{metrics.coverage}: {list_names(stretches, _STRETCHES)}\n"
     for label, model in by_label.items():
-        if model.gain_psnr_db is not None:
-            note += (f"{label}, after the best gain per channel of each view: "
-                     f"{model.gain_psnr_db:.2f} dB\n")
         note += f"{label}, {_gap(model)}\n"
         if moving := metrics.describe_moving(model):
             note += f"{label}, {moving}\n"
@@ -327,7 +324,7 @@ def _difference(models: Mapping[str, ModelMetrics], key: str) -> Interval:
 
 def _gap(model: ModelMetrics) -> str:
     """Returns how much better the views are that training saw."""
-    held_out = model.psnr_db if model.gain_psnr_db is None else model.gain_psnr_db
+    held_out = model.gap_psnr_db
     splits = {**model.seen_psnr_db, "held out": held_out}
     text = f"PSNR of {', '.join(f'{name} {value:.2f}' for name, value in splits.items())} dB"
     if "training" not in model.seen_psnr_db:

@@ -24,12 +24,14 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
+from recon_cli.scene.motion import Motion
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.train.background import FarContent, faces, far_content, look_at_one_thing
 from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
+from recon_cli.train.motion_blur import blurred_psnr
 from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_search import (
     Judge,
@@ -41,6 +43,7 @@ from recon_cli.train.moving_search import (
     shows_movement,
 )
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.shutter import BlurEvidence, ViewMotions
 from recon_cli.train.task import Task
 from recon_cli.workspace.summaries import TrialDecision
 
@@ -119,18 +122,25 @@ def split(training: int, validation: int) -> Split | None:
     return Split(train, held_out, own=True)
 
 
+# Gain that blur needs: a room that gained 2.6 dB on sharp views gained 1.6 in its trial; two walks
+# gained 0 and .1, and their sharp views nothing.
+BLUR_DB = 0.5
+_BLUR_SIDE = 300  # pixels of the longer side in the trial of blur, which is gone at LEVEL
+# Times the shutter time of edges 2 pixels wide. 2.8 in a room that was blurred by a known time: its
+# edges are softer.
+SHUTTERS = 1.25, 2.5
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
 _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
-PARTS = ("far", "stereo", "exposure", "images", "depth")
+PARTS = ("far", "stereo", "exposure", "images", "depth", "blur")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
     """Returns the parts of the model that trials decide on, by the names of their options."""
-    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
+    return {name: getattr(config, name) for name in (*PARTS, "shutter", "sh_degree")}
 
 
 @dataclass(frozen=True)
@@ -184,12 +194,24 @@ def examine(scene: TrialScene) -> Needs:
         settle("images", "denoised", "")
     settle("far", "on" if bench.far.share > 0 else None, "points cover all that the views see")
     drift = bench.drift
+    if config.look == "even" and config.exposure == "auto":
+        decisions.append(TrialDecision(
+            name="exposure", on=drift.drifts, mean_db=None, standard_error_db=None, seconds=0.0,
+            reason="one exposure for all is asked for, and brightness of the same points differs "
+            f"by {100 * drift.spread:.1f}%"))
+        config = replace(config, exposure=_word("exposure", on=drift.drifts))
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
     if config.depth == "auto" and not (scene.task.has_depth or scene.task.depth_refused):
         config = replace(config, depth="off")
     settle("depth", "on" if scene.task.has_depth else None, scene.task.depth_refused)
+    if config.blur != "off":
+        blur = bench.blur
+        if config.shutter is None:
+            config = replace(config, shutter=bench.shutter(config))
+        settle("blur", "on" if blur.speaks else None,
+               "the motion of the camera does not tell which views are blurred")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
     # what is compared with tables of the literature sees what they saw
@@ -220,8 +242,29 @@ class _Bench:
         drifting = task.schedule.config.exposure != "off"
         self.drift = (estimate_gains(task.train, scene.points) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))
+        self.blur = (task.motions.find_blur(task.train)
+                     if task.motions is not None and task.schedule.config.blur != "off"
+                     else BlurEvidence.nothing())
         self._scores: dict[tuple[object, ...], list[float]] = {}
         self._models: dict[tuple[object, ...], Splats] = {}
+
+    def shutter(self, config: RunConfig) -> float | None:
+        """Returns the shutter time in seconds that explains views best; None without evidence.
+
+        Without views to try it on, that of the evidence.
+        """
+        if self.blur.seconds == 0 or not (self.blur.speaks or config.blur == "on"):
+            return None
+        times = [factor * self.blur.seconds for factor in SHUTTERS]
+        if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
+            return times[0]
+        return max(times, key=lambda time: float(np.mean(self._run(
+            replace(config, blur="on", shutter=time), self._blur_level))))
+
+    @property
+    def _blur_level(self) -> int:
+        camera = self._scene.task.train[0].camera
+        return max(1, round(max(camera.width, camera.height) / _BLUR_SIDE))
 
     def try_part(self, part: str, config: RunConfig, value: str) -> TrialDecision:
         """Returns whether a part pays on top of those that are on already."""
@@ -233,7 +276,7 @@ class _Bench:
             return skip_trial(part, "too few of the views to score see any of it")
 
         def scores(config: RunConfig) -> list[float]:
-            values = self._run(config)
+            values = self._run(config, self._blur_level if part == "blur" else LEVEL)
             return [values[i] for i in telling]
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
@@ -242,6 +285,7 @@ class _Bench:
         lenient = part == "depth" or (
             part == "far" and not look_at_one_thing(self._scene.task.train))
         return decide(part, (lambda: scores(without), lambda: scores(with_it)),
+                      threshold_db=BLUR_DB if part == "blur" else THRESHOLD_DB,
                       unless_worse=lenient)
 
     def degree(self, config: RunConfig, decisions: list[TrialDecision]) -> int:
@@ -262,6 +306,7 @@ class _Bench:
     def find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
         """Returns where each training and validation view shows what moves; None: no masks pay."""
         start, task = time.perf_counter(), self._scene.task
+        config = replace(config, blur="off")  # that a view is blurred alike is no contradiction
         if split(len(task.train), len(task.validation)) is None:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None
@@ -331,11 +376,11 @@ class _Bench:
         held_out = task.train if chosen.own else task.validation
         return chosen.train, [held_out[i] for i in chosen.held_out]
 
-    def _run(self, config: RunConfig) -> list[float]:
+    def _run(self, config: RunConfig, level: int = LEVEL) -> list[float]:
         """Returns the corrected PSNR in dB of each held-out view after a short run."""
-        key = _key(config)
+        key = _key(config, level)
         if key not in self._scores:
-            self._models[key], self._scores[key] = self._train(self._short(config))
+            self._models[key], self._scores[key] = self._train(self._short(config), level)
         return self._scores[key]
 
     def _short(self, config: RunConfig, finer: float = 1.0) -> RunConfig:
@@ -345,24 +390,31 @@ class _Bench:
             max_gaussians=min(config.max_gaussians, round(finer * _CAP)), early_stop=False,
             batch_views=1)
 
-    def _train(self, config: RunConfig) -> tuple[Splats, list[float]]:
+    def _train(self, config: RunConfig, level: int) -> tuple[Splats, list[float]]:
         scene, train = self._scene, self._scene.task.train
         if scene.twins is not None and config.images == "denoised":
             train = [replace(twin, depth=view.depth)
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
-        splats = self._fit(config, [train[i] for i in rows])
-        return splats, self._score(splats, held_out, config)
+        motions = scene.task.motions and scene.task.motions.select(rows)
+        splats = self._fit(config, [train[i] for i in rows], factor=level, motions=motions)
+        return splats, self._score(splats, held_out, config, level, self._held_out_motions(config))
 
     def _score(
-        self, splats: Splats, views: Sequence[TrainView], config: RunConfig
+        self, splats: Splats, views: Sequence[TrainView], config: RunConfig, level: int = LEVEL,
+        motions: Sequence[Motion | None] = (),
     ) -> list[float]:
-        backend = self._scene.task.backend
-        return [mean_psnr(splats, [reduce_view(view, LEVEL)], config.sh_degree, backend,
-                          corrected=True) for view in views]
+        """Returns the corrected PSNR in dB of each view, blurred by its motion where it has one."""
+        task, degree = self._scene.task, config.sh_degree
+        small = [reduce_view(view, level) for view in views]
+        return [
+            mean_psnr(splats, [view], degree, task.backend, corrected=True) if motion is None
+            else blurred_psnr(splats, view, motion, replace(task, schedule=Schedule(config)))
+            for view, motion in zip(small, motions or [None] * len(small), strict=True)]
 
     def _fit(
-        self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL
+        self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL,
+        motions: ViewMotions | None = None,
     ) -> Splats:
         """Returns the Gaussians of a short run on views reduced by a factor."""
         scene, task = self._scene, self._scene.task
@@ -373,11 +425,22 @@ class _Bench:
                                      means_rate=_FURTHER * recipe.means_rate)
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(view, factor) for view in views], [], schedule, task.extent,
-                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
+                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo,
+                     motions=motions)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, config.iterations)
         return state.splats
+
+    def _held_out_motions(self, config: RunConfig) -> Sequence[Motion | None]:
+        """Returns the motions of the views to score; None for those that are scored as sharp."""
+        task = self._scene.task
+        chosen = split(len(task.train), len(task.validation))
+        assert chosen is not None
+        if config.blur != "on" or task.motions is None:
+            return [None] * len(chosen.held_out)
+        motions = task.motions.train if chosen.own else task.motions.validation
+        return [motions[i] for i in chosen.held_out]
 
 
 def _settled(config: RunConfig) -> RunConfig:
@@ -388,7 +451,6 @@ def _settled(config: RunConfig) -> RunConfig:
     return config
 
 
-def _key(config: RunConfig) -> tuple[object, ...]:
+def _key(config: RunConfig, level: int = LEVEL) -> tuple[object, ...]:
     """Returns what tells the short runs of a scene apart."""
-    config = _settled(config)
-    return config.sh_degree, *(getattr(config, part) for part in PARTS)
+    return level, *model_parts(_settled(config)).values()

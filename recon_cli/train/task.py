@@ -14,6 +14,7 @@ from recon_cli.scene.cells import Cell
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.shutter import ViewMotions
 from recon_cli.train.stereo_points import StereoPoints
 
 
@@ -32,6 +33,7 @@ class Task:
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
     stereo: StereoPoints | None = None  # of the training views; None where they are not known
     depth_refused: str = ""  # why no view has sensor depth although the capture has some
+    motions: ViewMotions | None = None  # of the views; None where no blur is looked for
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
         """Returns 1 for each position where Gaussians may be added, else 0."""

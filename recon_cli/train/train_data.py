@@ -31,6 +31,7 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
+from recon_cli.train.shutter import ViewMotions
 from recon_cli.train.stereo_points import SparseModel, StereoPoints
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import read_json, write_bytes
@@ -71,12 +72,17 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     if ctx.device == "cuda":
         train = [view.page_locked() for view in train]
     nearness = scene.nearness if len(scene.points) else None
+    validation = load_views(scene.validation, config, ctx, file)
+    motions = scene.motions
     return Task(
-        train, [*load_views(scene.validation, config, ctx, file)], Schedule(config), scene.extent,
+        train, [*validation], Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), nearness=nearness, cell=scene.cell,
         stereo=StereoPoints(
             train, lambda: _sparse_model(scene, [view.name for view in views]), ctx.progress),
-        depth_refused=sensor.refused)
+        depth_refused=sensor.refused,
+        motions=ViewMotions(
+            tuple(motions.get(view.name) for view in views),
+            tuple(motions.get(view.name) for view in validation), scene.points))
 
 
 def load_sensor_depth(scene: Scene, config: RunConfig) -> SensorViews:

@@ -28,6 +28,6 @@ def test_any_number_of_threads_gives_the_same_scores_in_the_order_of_the_views()
         splats, views, 0, "torch", threads=2, on_view=lambda view, _: saved.append(view.name))
     assert [score.name for score in one.views] == [view.name for view in views]
     assert one.views == two.views
-    assert one.corrected_db == two.corrected_db
+    assert all(each.gain_psnr_db >= each.psnr_db for each in one.views), one.views
     assert sorted(saved) == sorted(view.name for view in views)
     assert mean_psnr(splats, views, 0, "torch") == mean_psnr(splats, views, 0, "torch", threads=2)

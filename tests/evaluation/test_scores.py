@@ -1,6 +1,7 @@
 """Scores of models in closed form, and the tables that hold them."""
 
 import csv
+from dataclasses import replace
 
 import pytest
 
@@ -45,6 +46,21 @@ def test_lpips_has_no_mean_where_a_view_has_none():
     assert whole.lpips == pytest.approx(0.2)
     assert "LPIPS" in model_table({"x": half, "y": whole}).headings
     assert "LPIPS" not in model_table({"x": half}).headings
+
+
+def test_the_gain_has_a_column_where_it_was_measured_and_a_gap_of_its_own():
+    views = tuple(replace(view("a.png", psnr, 0.9), gain_psnr_db=psnr + 2) for psnr in (30.0, 32.0))
+    common = {"gaussians": 1, "bytes": 1, "render_ms": 1}
+    plain = ModelMetrics.from_views(views, **common)
+    gained = ModelMetrics.from_views(views, seen_after_gains=True, **common)
+    assert plain.gain_psnr_db == 33.0
+    table = model_table({"x": plain})
+    assert table.rows[0][table.headings.index("after gain")] == "33.00"
+    assert "after gain" not in model_table(scores()).headings, "of an older version"
+    assert (plain.gap_psnr_db, gained.gap_psnr_db) == (31.0, 33.0)
+    older = ModelMetrics.from_json({
+        key: value for key, value in gained.to_json().items() if key != "seen_after_gains"})
+    assert older.gap_psnr_db == 33.0, "which had it only with --exposure"
 
 
 def test_every_table_holds_the_same_figures():
