@@ -36,7 +36,8 @@ class IngestConfig(StageConfig):
         minimum=0.0, maximum=1.0)
     overlays: str = option(
         "mask", "Text, logos, dirt on the lens or a car's bonnet that stay in place in every frame "
-        "of a video, and the black border of a fisheye: mask or keep them.", choices=("mask", "keep"))
+        "of a video, and the black border of a fisheye: mask or keep them.",
+        choices=("mask", "keep"))
 
     camera: str = option(
         "auto", "Projection of the pictures: perspective, equirectangular (360-degree panoramas), "
