@@ -72,6 +72,34 @@ def hide_border(
     return ~counts
 
 
+class BorderMeter:
+    """Takes the gray frames of a sequence, one by one, and tells their border from darkness."""
+
+    def __init__(self) -> None:
+        self._brightest: NDArray[np.uint8] | None = None
+        self._filled = False  # some corner is lit
+
+    def advance(self, gray: NDArray[np.uint8]) -> None:  # [H, W]
+        """Takes a frame; all are of one size."""
+        if self._filled:
+            return
+        small = _reduce(gray)
+        self._brightest = (small if self._brightest is None
+                           else np.maximum(self._brightest, small))
+        self._filled = not _has_black_corners(self._brightest)
+
+    def without_border(self, exposures: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns exposures [F, 3], by `measure_exposure`, of what lies inside the border alone."""
+        circle = None if self._filled or self._brightest is None else fit_circle(self._brightest)
+        if circle is None:
+            return exposures
+        height, width = self._brightest.shape if self._brightest is not None else (1, 1)
+        inside = float(circle.inside(width, height).mean())
+        black, blown, spread = exposures.T
+        return np.column_stack([
+            np.clip((black - (1 - inside)) / inside, 0, 1), np.clip(blown / inside, 0, 1), spread])
+
+
 def find_circle(frames: Sequence[Path]) -> LensCircle | None:
     """Returns the round picture in frames of one size; None where they fill their corners."""
     brightest: NDArray[np.uint8] | None = None
@@ -113,12 +141,16 @@ def fit_circle(brightest: NDArray[np.uint8]) -> LensCircle | None:  # [h, w]
 
 def _read_small(path: Path) -> NDArray[np.uint8]:  # [h, w]
     """Returns the brightest channel of a frame, reduced."""
-    rgb = read_png(path)
-    scale = SIZE / max(rgb.shape[:2])
-    if scale < 1:
-        rgb = np.asarray(cv2.resize(
-            rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-    return np.asarray(rgb.max(axis=2), np.uint8)
+    return np.asarray(_reduce(read_png(path)).max(axis=2), np.uint8)
+
+
+def _reduce(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Returns an image whose longer side is `SIZE` at most."""
+    scale = SIZE / max(image.shape[:2])
+    if scale >= 1:
+        return image
+    return np.asarray(cv2.resize(
+        image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _has_black_corners(image: NDArray[np.uint8]) -> bool:

@@ -24,6 +24,7 @@ from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, meas
 from recon_cli.capture.frame_selection import MIN_AUTOMATIC
 from recon_cli.capture.images import BROKEN, WHITE, Photo, open_image, read_gray
 from recon_cli.capture.ingested_source import IngestContext
+from recon_cli.capture.lens_border import BorderMeter
 from recon_cli.capture.photos import group_photos
 from recon_cli.capture.scan import Scan
 from recon_cli.capture.strangers import find_strangers
@@ -200,7 +201,7 @@ class MeasuredPhotos:
         self._least = least
         self.places: list[int] = []
         self.follows: list[bool] = []  # whether a photo shows what the one before shows
-        self._meter, self._tracker = MotionMeter(), Tracker()
+        self._meter, self._tracker, self._border = MotionMeter(), Tracker(), BorderMeter()
         self._rows: list[tuple[float, float, tuple[float, float, float]]] = []
 
     def add(self, place: int, gray: NDArray[np.uint8]) -> None:
@@ -211,6 +212,7 @@ class MeasuredPhotos:
             shared = np.intersect1d(before, self._tracker.corners[0], assume_unique=True)
             self.follows.append(bool(len(before)) and len(shared) >= self._least * len(before))
         self.places.append(place)
+        self._border.advance(gray)
         self._rows.append(
             (measure_sharpness(gray), self._meter.advance(gray), measure_exposure(gray)))
 
@@ -231,7 +233,8 @@ class MeasuredPhotos:
         return Scan(
             width=width, height=height, declared=count, gaps=0,
             sharpness=np.array(sharpness, np.float64), motion=np.array(motion, np.float64),
-            exposure=np.round(exposure, 4), seconds=(None,) * count,
+            exposure=np.round(self._border.without_border(np.array(exposure)), 4),
+            seconds=(None,) * count,
             intact=np.ones(count, np.bool_), tracks=self._tracker.tracks(), overlay=None,
             notices=())
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from recon_cli.capture import video
 from recon_cli.capture.decoded_picture import DecodedPicture, Gap
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
+from recon_cli.capture.lens_border import BorderMeter
 from recon_cli.capture.static_overlay import OverlayMeter
 from recon_cli.capture.tracker import Tracker
 from recon_cli.capture.video_colour import WIDE_GAMUTS
@@ -146,7 +147,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     measures: list[_FrameMeasures] = []
     gaps: list[tuple[int, int | None]] = []  # (frames before it, pts)
     first: DecodedPicture | None = None
-    meter, tracker, overlay = MotionMeter(), Tracker(), OverlayMeter()
+    meter, tracker, overlay, border = MotionMeter(), Tracker(), OverlayMeter(), BorderMeter()
     with ThreadPoolExecutor(1) as beside:  # the two halves take about as long
         for item in video.decode(path, threads=threads):
             if isinstance(item, Gap):
@@ -157,6 +158,7 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
             measured = beside.submit(_measure, item, gray, meter)
             tracker.advance(gray)
             overlay.advance(gray, *tracker.corners)
+            border.advance(gray)
             measures.append(measured.result())
             step()
     if first is None:
@@ -168,7 +170,8 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
         declared=claim.count(_frame_rate(measures) or claim.rate),
         sharpness=np.array([frame.sharpness for frame in measures], np.float64),
         motion=np.array([frame.motion for frame in measures], np.float64),
-        exposure=np.round([frame.exposure for frame in measures], 4),
+        exposure=np.round(
+            border.without_border(np.array([frame.exposure for frame in measures])), 4),
         seconds=tuple(frame.seconds for frame in measures),
         intact=_find_intact(measures, gaps), tracks=tracker.tracks(), overlay=overlay.overlay(),
         notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))

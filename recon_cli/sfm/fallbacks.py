@@ -192,6 +192,8 @@ def _begin_with_fisheye(
     named = any("FISHEYE" in group.model for group in job.groups)
     reason = "--camera-model asks for it" if named else "the matches are those of a fisheye lens"
     fisheye = Fallback(wide_lens.ATTEMPT, reason, lambda *_: set(), wide_lens.map_fisheye)
+    if named:  # the others would map with the model that the database begins with
+        return (fisheye,)
     return (fisheye, dataclasses.replace(ways[0], choose_pairs=lambda *_: set()), *ways[1:])
 
 

@@ -29,6 +29,7 @@ CLEARLY, SIGMAS = 0.05, 3.0
 # cameras were 9 cm off in a room, and 18% on one of 104 degrees, with 1.8 cm. SIMPLE_RADIAL, which
 # only those get who ask for it, lost 6% at most in the 20 captures.
 WRONG = 0.10
+LEAST_PX = 0.02  # that it must take away: features are not found more exactly
 LEAST_TRACK = 3  # observations of a point; two rays meet in whatever way
 LEAST_POINTS, LEAST_IMAGES = 100, 5  # that are judged; fewer decide nothing
 MOST_IMAGES = 40  # of a camera; they show a lens as well as all
@@ -88,10 +89,9 @@ def find_better_lenses(
             continue
         better = min(names, key=lambda name: float(errors[name][number].mean()))
         gain, noise = gain_over(errors[better][number], ours)
-        if gain > max(CLEARLY, SIGMAS * noise):
-            found.append(BetterLens(
-                number, camera.model_name, better, root(ours), root(errors[better][number]),
-                gain, noise))
+        error, less = root(ours), root(errors[better][number])
+        if gain > max(CLEARLY, SIGMAS * noise) and error - less > LEAST_PX:
+            found.append(BetterLens(number, camera.model_name, better, error, less, gain, noise))
     return tuple(found)
 
 

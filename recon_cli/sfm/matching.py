@@ -64,7 +64,7 @@ def create_database(job: MappingJob) -> None:
     for group in job.groups:
         pycolmap.import_images(
             temporary, job.frames, pycolmap.CameraMode.SINGLE, list(group.names),
-            _reader_options(group))
+            _reader_options(group, first_model(job, group)))
     with pycolmap.Database.open(temporary) as opened:
         names = {image.name for image in opened.read_all_images()}
     _check_readable(job, names)
@@ -80,9 +80,21 @@ def _check_readable(job: MappingJob, readable: Collection[str]) -> None:
             hint="Run `recon ingest --again`.")
 
 
-def _reader_options(group: CameraGroup, masks: Path | None = None) -> pycolmap.ImageReaderOptions:
+def first_model(job: MappingJob, group: CameraGroup) -> str:
+    """Returns the camera model with which matches are verified at first.
+
+    A fisheye's matches are as those of an ordinary lens without a focal length until its own is
+    found: with a wrong one no motion explains them. Segments have one model from the start.
+    """
+    late = "FISHEYE" in group.model and job.last != "model" and not job.segments
+    return CAMERA_MODEL if late or group.model == "auto" else group.model
+
+
+def _reader_options(
+    group: CameraGroup, model: str, masks: Path | None = None
+) -> pycolmap.ImageReaderOptions:
     options = pycolmap.ImageReaderOptions()
-    options.camera_model = CAMERA_MODEL if group.model == "auto" else group.model
+    options.camera_model = model
     if masks is not None:
         options.mask_path = masks
     if group.lens is not None:

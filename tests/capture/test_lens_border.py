@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from media import texture
 
-from recon_cli.capture.lens_border import LensCircle, find_circle, fit_circle, hide_border
+from recon_cli.capture.lens_border import (
+    BorderMeter,
+    LensCircle,
+    find_circle,
+    fit_circle,
+    hide_border,
+)
 from recon_cli.io.images import read_png, write_png
 
 WIDTH, HEIGHT = 320, 240
@@ -93,3 +99,18 @@ def test_a_circle_is_the_same_at_any_size():
     circle = LensCircle(0.5, 0.375, 0.3)
     small, large = circle.inside(160, 120).mean(), circle.inside(640, 480).mean()
     assert small == pytest.approx(large, rel=0.02)
+
+
+def test_a_border_is_not_taken_for_darkness():
+    exposures = np.array([[0.55, 0.0, 40.0], [0.9, 0.02, 10.0]])
+    meter = BorderMeter()
+    for index in range(4):
+        meter.advance(round_frame(index).max(axis=2))
+    inside = np.pi * (0.97 * RADIUS) ** 2 / WIDTH / HEIGHT
+    black, blown, spread = meter.without_border(exposures).T
+    np.testing.assert_allclose(black, (exposures[:, 0] - 1 + inside).clip(0) / inside, atol=0.01)
+    np.testing.assert_allclose(blown, exposures[:, 1] / inside, atol=0.01)
+    np.testing.assert_array_equal(spread, exposures[:, 2])
+    meter.advance(texture(HEIGHT, WIDTH, seed=1)[..., 0])
+    np.testing.assert_array_equal(meter.without_border(exposures), exposures)
+    np.testing.assert_array_equal(BorderMeter().without_border(exposures), exposures)

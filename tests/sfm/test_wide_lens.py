@@ -163,9 +163,18 @@ def test_an_ordinary_capture_is_mapped_as_before(tmp_path):
     assert fallbacks._begin_with_fisheye(job, ways, report) is ways
     named = dataclasses.replace(job, groups=(
         dataclasses.replace(job.groups[0], model="OPENCV_FISHEYE"),))
-    first, second, *_ = fallbacks._begin_with_fisheye(named, ways, report)
-    assert (first.name, first.reason) == ("fisheye", "--camera-model asks for it")
-    assert second.name == ways[0].name
+    (way,) = fallbacks._begin_with_fisheye(named, ways, report)
+    assert (way.name, way.reason) == ("fisheye", "--camera-model asks for it")
+
+
+def test_matches_of_a_named_fisheye_are_verified_without_its_focal_length_at_first(tmp_path):
+    job, _ = capture_of(tmp_path, FISHEYE, points=60)
+    named = dataclasses.replace(job.groups[0], model="OPENCV_FISHEYE")
+    assert matching.first_model(job, named) == "OPENCV"
+    assert matching.first_model(dataclasses.replace(job, last="model"), named) == "OPENCV_FISHEYE"
+    radial = dataclasses.replace(named, model="RADIAL")
+    assert matching.first_model(job, radial) == "RADIAL"
+    assert matching.first_model(job, job.groups[0]) == "OPENCV"
 
 
 def test_segments_stay_with_one_model_of_lenses_and_say_so(tmp_path):

@@ -324,6 +324,33 @@ def test_an_overlay_is_kept_on_request(marked, tmp_path, notices):
     assert not any("fixed" in notice for notice in notices())
 
 
+def round_pictures(frames):
+    """Frames as a fisheye shows them: a disk, and black around it."""
+    height, width = frames[0].shape[:2]
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    disk = (np.hypot(x, y) < 0.48 * height)[..., None]
+    return [frame * disk for frame in frames]
+
+
+def test_the_border_of_a_fisheye_video_is_masked_or_kept_on_request(tmp_path, notices):
+    video = write_video(
+        tmp_path / "round.mp4", round_pictures(walk(40, step=6, height=180, width=320)))
+    take(video, tmp_path / "out")
+    frames = listed(tmp_path / "out")["frames"]
+    assert all(frame["masked"] for frame in frames)
+    for frame in frames:
+        mask = images.read_mask(tmp_path / "out" / "masks" / frame["name"], 320, 180)
+        assert 0.25 < mask.mean() < np.pi * (0.48 * 180) ** 2 / 320 / 180
+        assert mask[90, 100:220].all()
+    tracks = Tracks.read(tmp_path / "out" / "tracks.safetensors")
+    away = np.linalg.norm((tracks.xy - 0.5) * (320, 180), axis=1)
+    assert len(away) > 100
+    assert away.max() < 0.48 * 180
+    assert any("round picture of a fisheye" in notice for notice in notices())
+    take(video, tmp_path / "kept", config=IngestConfig(overlays="keep"))
+    assert not any(frame["masked"] for frame in listed(tmp_path / "kept")["frames"])
+
+
 @pytest.mark.integration
 def test_a_walk_without_an_overlay_gets_no_mask(tmp_path):
     video = write_video(tmp_path / "walk.mp4", walk(60, step=12, height=180, width=320))

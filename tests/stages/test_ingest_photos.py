@@ -478,3 +478,23 @@ def test_a_damaged_record_of_an_earlier_run_is_made_again(tmp_path):
         (tmp_path / "out" / "raw.json").write_bytes(damage)
         take(tmp_path / "room", tmp_path / "out")
         assert (tmp_path / "out" / "raw.json").read_bytes() == kept
+
+
+def test_the_border_of_fisheye_photos_is_masked_beside_their_own_masks(tmp_path):
+    folder = tmp_path / "round"
+    folder.mkdir()
+    x, y = np.meshgrid(np.arange(128) + 0.5 - 64, np.arange(96) + 0.5 - 48)
+    disk = (np.hypot(x, y) < 45)[..., None]
+    for index in range(4):
+        Image.fromarray(blocks(96, 128, seed=index) * disk).save(folder / f"{index}.png")
+    own = np.full((96, 128), 255, np.uint8)
+    own[40:50, 60:70] = 0
+    mask_of(folder / "masks", "2.png", own)
+    take(folder, tmp_path / "out")
+    masks = {path.stem: np.asarray(Image.open(path)) for path in (
+        tmp_path / "out" / "masks").iterdir()}
+    assert len(masks) == 4
+    assert all(frame["masked"] for frame in listed(tmp_path / "out")["frames"])
+    assert all(not mask[~disk[..., 0]].any() for mask in masks.values())
+    assert not masks["2"][40:50, 60:70].any()
+    assert masks["1"][40:50, 60:70].all()
