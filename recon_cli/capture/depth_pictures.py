@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from recon_cli.io.images import decode_file
 
-# As a photo, depth in millimetres is nearly black: rooms end at 16 m, a quarter of the range. The
-# brightest thousandth of the gray photos of ten captures lay above four fifths of it.
-_DARK, _BRIGHTEST = 0.25, 0.999
 # The inverse depth of a plane is linear in the image. Its second differences, relative to it and in
 # the median of the pixels, were .003 to .006 in the depth of two rooms and of a phone, and .03 to
 # .5 in the gray photos of ten captures, the least of them with blurred walls.
-_SMOOTH = 0.012
+_SMOOTH, _ROUGH = 0.012, 0.03
+# Between the two brightness decides. As a photo, depth in millimetres is nearly black: rooms end at
+# 16 m, a quarter of the range. So are photos of 12 bits, but the brightest thousandth of other gray
+# photos of ten captures lay above four fifths of it.
+_DARK, _BRIGHTEST = 0.25, 0.999
 _SIDE = 160  # pixels of the longer side that is looked at
 
 
@@ -30,7 +31,7 @@ def look_like_depth(paths: Sequence[Path]) -> bool:
     if not measured:
         return False
     bright, rough = np.median(measured, axis=0)
-    return bool(bright < _DARK or rough < _SMOOTH)
+    return bool(rough < (_ROUGH if bright < _DARK else _SMOOTH))
 
 
 def _look(data: NDArray[Any]) -> tuple[float, float] | None:

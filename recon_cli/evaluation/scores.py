@@ -33,8 +33,8 @@ class ViewScore(JsonRecord):
     ssim: float  # by scikit-image
     ssim_padded: float  # by INRIA's convention
     lpips: float | None = None  # None where it was not measured
-    gain_psnr_db: float | None = None  # after its best gain per channel; None in older files
     pixels_scored: float | None = None  # fraction that a mask leaves; None without a mask
+    gain_psnr_db: float | None = None  # after its best gain per channel; None in older files
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def read_obj(path: Path) -> Mesh:
     faces = faces[:, ::2] if kinds["vt"] else faces
     triangles = faces.astype(np.int64) - 1
     marks = None
-    if names:
+    if "inferred" in names:
         marks = np.zeros(len(vertices), bool)
         for name, first, last in zip(names, materials, [*materials[1:], len(faces)], strict=True):
             if name == "inferred":

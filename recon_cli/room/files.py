@@ -65,10 +65,10 @@ def _same_look(back: Mesh, mesh: Mesh, tinted: bool) -> bool:
 
     A .jpg has other pixels, and a .ply has no texture.
     """
-    if mesh.inferred is None or back.inferred is None:
-        if mesh.inferred is not back.inferred:
-            return False
-    elif not np.array_equal(back.inferred, mesh.inferred):
+    marks, marked = (
+        np.zeros(len(each.vertices), bool) if each.inferred is None else each.inferred
+        for each in (back, mesh))
+    if not np.array_equal(marks, marked):
         return False
     if back.texture is not None and mesh.texture is not None:
         image, other = back.texture.image, mesh.texture.image

@@ -106,7 +106,7 @@ class BlurredSteps:
     """Chooses for each step of a run how its view is compared: as it is, or blurred."""
 
     def __init__(self, task: Task, plain: GradientStep) -> None:
-        self._schedule, self._plain = task.schedule, plain
+        self._schedule = task.schedule
         self._blur = _blur_of(task) if task.schedule.config.blur == "on" else None
         self._blurred = _BlurredStep(task.backend, plain)
         self._speeds: dict[int, float] = {}  # pixels/s at the width of 1
@@ -119,20 +119,20 @@ class BlurredSteps:
         drawn = torch.rand(len(order), generator=generator, dtype=torch.float64)
         return order[drawn < self._chances[order]]
 
-    def choose(self, view: TrainView, index: int, iteration: int) -> GradientStep:
-        """Returns the step for a training view, reduced or not, by its index."""
+    def choose(self, view: TrainView, index: int, iteration: int) -> GradientStep | None:
+        """Returns the step for a training view by its index; None where it is compared as it is."""
         if self._blur is None or not self._schedule.blurs(iteration):
-            return self._plain
+            return None
         (motions, seconds), motion = self._blur, self._blur[0].train[index]
         if motion is None:
-            return self._plain
+            return None
         if index not in self._speeds:
             speed = median_speed(view.camera, motion, motions.points)
             self._speeds[index] = speed / view.camera.width
         cameras = cameras_along(
             view.camera, motion, seconds, self._speeds[index] * view.camera.width)
         if len(cameras) == 1:
-            return self._plain
+            return None
         self._blurred.cameras = cameras
         return self._blurred
 

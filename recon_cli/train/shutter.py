@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 
 from recon_cli.io.images import reduce_view
 from recon_cli.scene.camera import Camera
@@ -91,7 +90,8 @@ def find_blur(
                for time in _TIMES]
     best = int(np.argmin(spreads))
     explained = 1 - spreads[best] / max(_spread(ratios, bins), 1e-12)
-    correlation = float(spearmanr(speeds, ratios).statistic)
+    ranks = [np.argsort(np.argsort(row)) for row in (speeds, ratios)]
+    correlation = float(np.corrcoef(ranks)[0, 1])  # scipy.stats takes a second to import
     return BlurEvidence(float(_TIMES[best]), explained, correlation)
 
 

@@ -108,7 +108,7 @@ class Stepper:
             loo=importance is not None and importance.leaves_out,
             harmonics=schedule.moves_sh(iteration), depth_weight=schedule.depth_weight(iteration))
         gain = None if state.exposure is None else state.exposure.gain(index)
-        compute = self._blurred.choose(view, index, iteration)
+        compute = self._blurred.choose(view, index, iteration) or self._compute
         result.loss[place], statistics = compute(state.optimizer, view, options, gain)
         if statistics is None or not np.isfinite(result.loss[place]):
             return None

@@ -389,9 +389,10 @@ def test_progress_that_would_survive_a_crash_is_recorded(video, tmp_path):
     seen = []
     out = tmp_path / "out"
     take(video, out, config=IngestConfig(frames=10), record=lambda done, total: seen.append(
-        (done, total, len(list((out / "frames").iterdir())))))
+        (done, total, len(list((out / "frames").glob("*.png"))))))
     assert seen[-1] == (10, 10, 10)
-    assert all(done == stored for done, _, stored in seen)
+    assert [done for done, _, _ in seen] == list(range(1, 11))
+    assert all(done <= stored for done, _, stored in seen)
 
 # Real captures
 

@@ -40,7 +40,7 @@ def test_a_camera_that_sets_its_exposure_is_found_and_helped():
 
 
 def test_one_exposure_for_all_needs_no_trial_but_a_drift():
-    config = replace(CONFIG, look="even", far="off")
+    config = replace(CONFIG, look="even", far="off", moving="off")
     even, plain = examine(scene(drift=0.15, config=config)), examine(scene(config=config))
     assert (even.config.exposure, plain.config.exposure) == ("on", "off")
     assert even.seconds == 0
@@ -55,7 +55,7 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 def test_what_the_options_say_is_not_tried():
     config = replace(
-        CONFIG, far="off", stereo="on", exposure="on", moving="off", blur="off")
+        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", blur="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config

@@ -102,12 +102,12 @@ def test_only_the_last_part_of_a_run_is_blurred_and_all_of_a_continued_one():
     plain = gradient_step("torch")
     task = blurred_task()
     steps = BlurredSteps(task, plain)
-    assert steps.choose(task.train[0], 0, 36) is plain
-    assert steps.choose(task.train[0], 0, 37) is not plain
+    assert steps.choose(task.train[0], 0, 36) is None
+    assert steps.choose(task.train[0], 0, 37) is not None
     off = BlurredSteps(replace(task, schedule=Schedule(CONFIG)), plain)
-    assert off.choose(task.train[0], 0, 60) is plain
+    assert off.choose(task.train[0], 0, 60) is None
     continued = replace(task, schedule=make_schedule(BLURRED, 0))
-    assert BlurredSteps(continued, plain).choose(task.train[0], 0, 1) is not plain
+    assert BlurredSteps(continued, plain).choose(task.train[0], 0, 1) is not None
 
 
 def test_an_interrupted_run_ends_with_the_same_bytes(tmp_path):
@@ -183,7 +183,9 @@ def test_a_trial_finds_blur_and_the_run_leaves_it_out_of_the_scene():
 @pytest.mark.integration
 def test_sharp_views_pay_for_no_trial():
     task, _ = filmed(scene().task, 0.0)
-    needs = examine(replace(scene(), task=task, points=task.motions.points))
+    points = task.motions.points
+    needs = examine(replace(
+        scene(), task=task, points=points, colors=np.full((len(points), 3), 128, np.uint8)))
     decision = next(one for one in needs.decisions if one.name == "blur")
     assert not decision.on
     assert decision.seconds == 0

@@ -66,7 +66,7 @@ def test_minutes_include_a_search_for_surfaces_that_only_the_longer_run_has_room
     task = tiny_task(RunConfig(stereo="on"))
     task = replace(task, train=20 * task.train, stereo=Slow())
     scene = SimpleNamespace(
-        train=(), points=np.zeros((9000, 3)), colors=np.zeros((9000, 3), np.uint8))
+        train=(), validation=(), points=np.zeros((9000, 3)), colors=np.zeros((9000, 3), np.uint8))
     for name, value in {
             "gaussians_that_fit": 10**9, "load_task": task, "count_detail": 16_000,
             "choose_parts": Needs(RunConfig(stereo="on"), ()), "_measure_cost": COST}.items():
