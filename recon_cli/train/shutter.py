@@ -91,7 +91,8 @@ def find_blur(
     best = int(np.argmin(spreads))
     explained = 1 - spreads[best] / max(_spread(ratios, bins), 1e-12)
     ranks = [np.argsort(np.argsort(row)) for row in (speeds, ratios)]
-    correlation = float(np.corrcoef(ranks)[0, 1])  # scipy.stats takes a second to import
+    # scipy.stats takes a second to import
+    correlation = float(np.asarray(np.corrcoef(ranks))[0, 1])
     return BlurEvidence(float(_TIMES[best]), explained, correlation)
 
 
