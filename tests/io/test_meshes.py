@@ -129,6 +129,8 @@ def test_a_texture_comes_back_with_its_places(suffix, kind, tmp_path):
     assert back.inferred.tolist() == [False] * 4 + [True] * 4
 
 
+@pytest.mark.skipif(
+    not hasattr(trimesh, "load_scene"), reason="older versions join the materials of an .obj")
 @pytest.mark.parametrize("suffix", ["glb", "obj"])
 def test_trimesh_reads_texture_and_inferred_surface_by_name(suffix, tmp_path):
     mesh = walls()
