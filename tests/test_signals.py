@@ -154,5 +154,5 @@ def test_a_program_that_is_ended_says_so_in_one_line(tmp_path, number, seconds, 
     if process.returncode in (-number, 0) or starting:
         pytest.skip("it was not yet, or no longer, at work")
     assert process.returncode == CODES[number]
-    lines = [line for line in said.splitlines() if "%|" not in line and line.strip()]
+    lines = [line for line in said.splitlines() if "%" not in line and line.strip()]  # no progress
     assert lines == [describe_end(Interrupted(number))]

@@ -97,7 +97,8 @@ def test_masked_views_say_how_much_was_scored_and_are_black_in_the_difference(gi
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     views = {view["name"]: view for view in metrics["models"]["base"]["views"]}
     assert views[SCORED]["pixels_scored"] == pytest.approx(1 - 20 * 17 / (36 * 48))
-    assert set(views[UNMASKED]) == {"name", "psnr_db", "psnr_8bit_db", "ssim", "ssim_padded"}
+    assert set(views[UNMASKED]) == {
+        "name", "psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "gain_psnr_db"}
     assert "Masks on 1 of 3 views" in (tmp_path / "out" / "table.txt").read_text()
     assert "ignored pixels" in metrics["mask_convention"]
     difference = read_image(tmp_path / "out" / "difference" / "base" / SCORED, 48, 36)

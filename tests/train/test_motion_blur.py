@@ -165,7 +165,7 @@ def test_blur_without_motion_or_time_is_refused():
 def test_a_trial_finds_blur_and_the_run_leaves_it_out_of_the_scene():
     made = scene()
     config = replace(made.task.schedule.config, far="off", exposure="off", stereo="off")
-    task, sharp = filmed(replace(made.task, schedule=Schedule(config)), 0.06)
+    task, sharp = filmed(replace(made.task, schedule=Schedule(config)), 0.09)
     points = task.motions.points
     task_scene = replace(made, task=task, points=points,
                          colors=np.full((len(points), 3), 128, np.uint8))
