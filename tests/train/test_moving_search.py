@@ -41,7 +41,7 @@ def decision(needs):
 def test_what_is_carried_past_is_masked_and_little_else():
     made = scene()
     views, boards = carried(made.task.train)
-    needs = examine(with_views(made, views, **PARTS))
+    needs = examine(with_views(made, views, **PARTS, moving="auto"))
     assert decision(needs).on, decision(needs).reason
     hidden = missed = spared = 0
     for region, board in zip(needs.moving, boards, strict=True):
@@ -67,12 +67,12 @@ def test_off_looks_for_nothing_and_on_skips_the_trial():
 
 @pytest.mark.integration
 def test_a_clean_wall_gets_no_mask_and_the_reference_recipe_does_not_look():
-    needs = examine(scene(config=replace(CONFIG, **PARTS)))
+    needs = examine(scene(config=replace(CONFIG, **PARTS, moving="auto")))
     assert needs.moving is None
     assert "no views contradict" in decision(needs).reason
     made = scene()
     views, _ = carried(made.task.train)
-    needs = examine(with_views(made, views, **PARTS, densify="reference"))
+    needs = examine(with_views(made, views, **PARTS, moving="auto", densify="reference"))
     assert needs.moving is None
 
 
