@@ -74,7 +74,11 @@ def test_an_empty_view_shows_the_background(case):
         assert out.statistics.broken == 0
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+SLOW = pytest.mark.slow  # an interpreter takes ten seconds for one
+
+
+@pytest.mark.parametrize("degree", [
+    0, pytest.param(1, marks=SLOW), pytest.param(2, marks=SLOW), 3])
 def test_images_agree_with_the_brute_force(case, degree):
     found = compared(case, random_splats(150, seed=degree), camera_at(), GREENISH, degree)
     assert found.image <= IMAGE_TOLERANCE[case.dtype]

@@ -286,7 +286,10 @@ def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, m
     assert result.attempts[2].kept
 
 
-@pytest.mark.parametrize("place", ["match", "models", "model", "note", "verdict", "publish"])
+@pytest.mark.parametrize("place", [
+    "match", "publish",
+    *(pytest.param(place, marks=pytest.mark.slow)
+      for place in ("models", "model", "note", "verdict"))])
 def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monkeypatch, place):
     job, truth = capture
     owner, name = {

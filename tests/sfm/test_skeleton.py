@@ -346,6 +346,7 @@ def test_the_coarsest_features_are_copied_and_no_matches(tmp_path, monkeypatch):
         assert not opened.num_matched_image_pairs()
 
 
+@pytest.mark.slow
 def test_photos_that_overlap_by_their_coarsest_features_are_matched_in_full(
     tmp_path, monkeypatch
 ):

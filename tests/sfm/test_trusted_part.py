@@ -88,6 +88,7 @@ def test_other_models_of_the_mapper_are_parts_without_what_a_larger_one_holds(tm
     assert held(deliver_parts(job, whole, [few, other])) == [made.names[:9], made.names[9:]]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_another_model_is_cut_where_it_is_broken(tmp_path):
     made = broken_walk(at=10)

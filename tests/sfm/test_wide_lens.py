@@ -132,6 +132,7 @@ def test_where_the_incremental_mapper_cannot_start_the_global_one_is_asked(tmp_p
     assert np.abs(found @ motion[:, :3].T + motion[:, 3] - centers).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_lens_that_the_errors_show_is_mapped_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(wide_lens, "CLEARLY", np.inf)  # its matches pass for an ordinary lens
     job, _ = capture_of(tmp_path, FISHEYE)
