@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import block_kernels
 import gauss_newton_kernels as kernels
 import numpy as np
 import torch
@@ -160,7 +161,7 @@ class Blocks:
     """A block-diagonal matrix: 11 x 11 for a Gaussian's geometry, diagonal for its colours."""
 
     def __init__(self, n: int) -> None:
-        self.geometry = np.zeros(n * kernels.TRIANGLE, np.float32)
+        self.geometry = np.zeros(n * block_kernels.TRIANGLE, np.float32)
         self.colors = np.zeros(3 * n, np.float32)
 
     def decay(self, factor: float) -> None:
@@ -171,7 +172,7 @@ class Blocks:
     def multiply(self, vector: Vector) -> Vector:
         """Returns the product with a vector."""
         result = vector.copy()
-        pool.run(kernels.multiply_blocks, self.geometry, *geometry(result), scratch=False)
+        pool.run(block_kernels.multiply_blocks, self.geometry, *geometry(result), scratch=False)
         parts(result)[4][:] *= self.colors
         return result
 
@@ -180,21 +181,21 @@ class BlockSolver:
     """Solves scale * blocks + diag(ridge), factorized once."""
 
     def __init__(self, n: int) -> None:
-        self._factors = np.empty(n * kernels.TRIANGLE, np.float32)
+        self._factors = np.empty(n * block_kernels.TRIANGLE, np.float32)
 
     def factorize(self, blocks: Blocks, scale: float, ridge: Vector) -> None:
         """Takes a matrix; `ridge` is a vector like that of the parameters, positive."""
         *rows, colors = parts(ridge)
         n = len(colors) // 3
-        rows = [row.reshape(n, -1) for row in rows]
-        pool.run(kernels.factorize, blocks.geometry, scale, np.concatenate(rows, axis=1).reshape(
-            -1), self._factors, scratch=False)
+        diagonal = np.concatenate([row.reshape(n, -1) for row in rows], axis=1).reshape(-1)
+        pool.run(block_kernels.factorize, blocks.geometry, scale, diagonal, self._factors,
+                 scratch=False)
         self._colors = 1 / (np.float32(scale) * blocks.colors + colors)
 
     def solve(self, vector: Vector) -> Vector:
         """Returns the solution of a right side."""
         result = vector.copy()
-        pool.run(kernels.solve_blocks, self._factors, *geometry(result), scratch=False)
+        pool.run(block_kernels.solve_blocks, self._factors, *geometry(result), scratch=False)
         parts(result)[4][:] *= self._colors
         return result
 

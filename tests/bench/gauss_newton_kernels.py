@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from block_kernels import SIZE, TRIANGLE
 
 from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd import LANES
@@ -60,8 +61,6 @@ from recon_cli.render.numba.soa import (
 )
 
 LN2 = np.float32(math.log(2))
-GEOMETRY = 11  # mean 3, quaternion 4, scales 3, logit 1
-TRIANGLE = GEOMETRY * (GEOMETRY + 1) // 2  # numbers of a symmetric block, its lower rows in turn
 TANGENT = 16  # numbers of a Gaussian's tangent: six of the exponent, three of the colour
 _RED, _GREEN, _BLUE = 6, 7, 8
 MOMENTS = 15  # of u^i v^j up to degree 4, by degree and j
@@ -195,7 +194,7 @@ def write_exponent(view, frame, change, work, out):
 def project_tangent(counter, ids, means, quats, log_scales, logits, records, view, d_means,
                     d_quats, d_log_scales, d_logits, d_sh_dc, tangents):
     """Writes the tangent of every Gaussian in `ids` for a change of the raw parameters."""
-    frame, change = np.empty(FRAME), np.empty(GEOMETRY)
+    frame, change = np.empty(FRAME), np.empty(SIZE)
     work, out = np.empty(9), np.empty(6)
     while True:
         block = fetch_add(counter, 0, 1)
@@ -415,9 +414,9 @@ def composite_blocks(counter, tile_start, members, slots, records, width, height
 def project_blocks(counter, ids, slot_start, sums, means, quats, log_scales, logits, records, view,
                    factor, blocks, colors):
     """Adds `factor` times the blocks of a view to `blocks` [N * 66] and `colors` [N * 3]."""
-    frame, change = np.empty(FRAME), np.zeros(GEOMETRY)
+    frame, change = np.empty(FRAME), np.zeros(SIZE)
     work, out = np.empty(9), np.empty(6)
-    total, map_, half = np.empty(MOMENTS + 3), np.empty((GEOMETRY, 6)), np.empty(6)
+    total, map_, half = np.empty(MOMENTS + 3), np.empty((SIZE, 6)), np.empty(6)
     square = np.float64(LN2) * np.float64(LN2) * factor
     while True:
         block = fetch_add(counter, 0, 1)
@@ -432,13 +431,13 @@ def project_blocks(counter, ids, slot_start, sums, means, quats, log_scales, log
                 for k in range(MOMENTS + 3):
                     total[k] += sums[slot * BLOCK_SLOT + k]
             write_frame(view, means, quats, log_scales, logits, i, frame)
-            for number in range(GEOMETRY):
+            for number in range(SIZE):
                 change[number] = 1
                 write_exponent(view, frame, change, work, out)
                 change[number] = 0
                 map_[number] = out
             at = i * TRIANGLE
-            for row in range(GEOMETRY):
+            for row in range(SIZE):
                 for k in range(6):
                     half[k] = 0
                     for m in range(6):
@@ -454,95 +453,3 @@ def project_blocks(counter, ids, slot_start, sums, means, quats, log_scales, log
             for k in range(3):
                 if records[j * RECORD + RED + k] > 0:
                     colors[3 * i + k] += factor * C0 * C0 * total[MOMENTS + k]
-
-
-@kernel
-def factorize(counter, blocks, scale, ridge, factors):
-    """Writes the Cholesky factors of scale * block + diag(ridge), [N * 66]; ridge is [N * 11]."""
-    n = len(blocks) // TRIANGLE
-    lower = np.empty((GEOMETRY, GEOMETRY))
-    while True:
-        block = fetch_add(counter, 0, 1)
-        if block * BLOCK >= n:
-            break
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, n)):
-            at = i * TRIANGLE
-            for row in range(GEOMETRY):
-                for column in range(row + 1):
-                    entry = scale * np.float64(blocks[at + row * (row + 1) // 2 + column])
-                    if row == column:
-                        entry += ridge[GEOMETRY * i + row]
-                    for k in range(column):
-                        entry -= lower[row, k] * lower[column, k]
-                    if row == column:
-                        # rounding of a sum of squares may leave less than the ridge
-                        entry = math.sqrt(max(entry, 1e-3 * ridge[GEOMETRY * i + row]))
-                    else:
-                        entry /= lower[column, column]
-                    lower[row, column] = entry
-                    factors[at + row * (row + 1) // 2 + column] = entry
-
-
-@kernel
-def solve_blocks(counter, factors, means, quats, log_scales, logits):
-    """Solves each Gaussian's system in place; the four arrays hold the right sides."""
-    n = len(logits)
-    x = np.empty(GEOMETRY)
-    while True:
-        block = fetch_add(counter, 0, 1)
-        if block * BLOCK >= n:
-            break
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, n)):
-            at = i * TRIANGLE
-            take(means, quats, log_scales, logits, i, x)
-            for row in range(GEOMETRY):
-                for k in range(row):
-                    x[row] -= factors[at + row * (row + 1) // 2 + k] * x[k]
-                x[row] /= factors[at + row * (row + 1) // 2 + row]
-            for row in range(GEOMETRY - 1, -1, -1):
-                for k in range(row + 1, GEOMETRY):
-                    x[row] -= factors[at + k * (k + 1) // 2 + row] * x[k]
-                x[row] /= factors[at + row * (row + 1) // 2 + row]
-            put(means, quats, log_scales, logits, i, x)
-
-
-@kernel
-def multiply_blocks(counter, blocks, means, quats, log_scales, logits):
-    """Multiplies each Gaussian's vector by its block in place."""
-    n = len(logits)
-    x, y = np.empty(GEOMETRY), np.empty(GEOMETRY)
-    while True:
-        block = fetch_add(counter, 0, 1)
-        if block * BLOCK >= n:
-            break
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, n)):
-            at = i * TRIANGLE
-            take(means, quats, log_scales, logits, i, x)
-            y[:] = 0
-            for row in range(GEOMETRY):
-                for column in range(row + 1):
-                    y[row] += blocks[at] * x[column]
-                    if column < row:
-                        y[column] += blocks[at] * x[row]
-                    at += 1
-            put(means, quats, log_scales, logits, i, y)
-
-
-@inlined
-def take(means, quats, log_scales, logits, i, x):
-    """Copies Gaussian i's numbers to `x` [11]."""
-    for k in range(3):
-        x[k], x[7 + k] = means[3 * i + k], log_scales[3 * i + k]
-    for k in range(4):
-        x[3 + k] = quats[4 * i + k]
-    x[10] = logits[i]
-
-
-@inlined
-def put(means, quats, log_scales, logits, i, x):
-    """Copies `x` [11] back."""
-    for k in range(3):
-        means[3 * i + k], log_scales[3 * i + k] = x[k], x[7 + k]
-    for k in range(4):
-        quats[4 * i + k] = x[3 + k]
-    logits[i] = x[10]
