@@ -92,11 +92,12 @@ class Method:
         level = self.task.schedule.level(1 + int(share * (steps - 1)))
         return self.task.pyramid.view(self._queue.pop(), level)
 
-    def look(self, linear: gn.LinearizedView, share: float, gradient: gn.Vector) -> None:
+    def look(self, linear: gn.LinearizedView, share: float, gradient: gn.Vector, *,
+             weigh: bool = True) -> None:
         """Linearises at the next view, and writes its gradient."""
         view = self.next_view(share)
         linear.render(self.values, view, self.background)
-        linear.pull(linear.compare(view, self.ssim_weight), gradient)
+        linear.pull(linear.compare(view, self.ssim_weight, weigh=weigh), gradient)
 
     def gather(self, linear: gn.LinearizedView, weight: float) -> None:
         """Adds a view to the running mean of the blocks."""
@@ -127,11 +128,11 @@ class Method:
 class LmOptions:
     """How lm steps."""
 
-    views: int = 4
+    views: int = 16
     products: int = 4  # with the curvature, of each view in a step
-    pixels: float = 0.5  # share that products see
+    pixels: float = 0.3  # share that products see
     damping: float = 1.0  # of the blocks of all views
-    ridge: float = 0.1
+    ridge: float = 0.05  # of a usual gradient over the rate
     momentum: float = 0.5  # of the step before, at which conjugate gradients start
     length: float = 1.0  # of a step; falls to a tenth of it
 
@@ -145,7 +146,6 @@ class LevenbergMarquardt(Method):
         super().__init__(task, start, seed)
         self.options = options or LmOptions()
         self._views = [gn.LinearizedView() for _ in range(self.options.views)]
-        self._solver = gn.BlockSolver(self.count)
         self._before = np.zeros_like(self.values)
 
     def step(self, share: float) -> None:
@@ -160,7 +160,7 @@ class LevenbergMarquardt(Method):
         rates = rates_of(self.task, share, self.count)
         ridge = self.ridge(rates, gradient, options.ridge)
         mean = self.mean_factor
-        self._solver.factorize(self.blocks, (1 + options.damping) * mean, ridge)
+        inverse = gn.invert(self.blocks, (1 + options.damping) * mean, ridge)
 
         def multiply(change: gn.Vector) -> gn.Vector:
             product = gn.multiply_views(self._views, change, options.pixels)
@@ -170,7 +170,7 @@ class LevenbergMarquardt(Method):
 
         start = np.float32(options.momentum) * self._before if options.momentum else None
         self._before = gn.conjugate_gradients(
-            multiply, -gradient, self._solver.solve, options.products, start)
+            multiply, -gradient, inverse.multiply, options.products, start)
         self.values += np.float32(options.length * 0.1**share) * self._before
 
 
@@ -178,11 +178,11 @@ class LevenbergMarquardt(Method):
 class BlockOptions:
     """How blocks steps."""
 
-    every: int = 4  # steps between views whose blocks are looked at
+    every: int = 8  # steps between views whose blocks are looked at
     momentum: float = 0.8
     length: float = 0.3  # of a Newton step
     most: float = 1.0  # rates that a number moves at most
-    ridge: float = 0.1
+    ridge: float = 0.03  # of a usual gradient over the rate
     colors_only: bool = False  # and opacities; Adam moves the others
 
 
@@ -195,7 +195,7 @@ class BlockNewton(Method):
         super().__init__(task, start, seed)
         self.options = options or BlockOptions()
         self._view = gn.LinearizedView()
-        self._solver = gn.BlockSolver(self.count)
+        self._inverse = gn.Blocks(self.count)
         self._mean = np.zeros_like(self.values)
         self._square = np.zeros_like(self.values)
         self._steps = 0
@@ -203,20 +203,22 @@ class BlockNewton(Method):
     def step(self, share: float) -> None:
         """Looks at a view and moves along the running mean of the gradients."""
         options, gradient = self.options, np.empty_like(self.values)
-        self.look(self._view, share, gradient)
+        gathers = self._steps % options.every == 0
+        self.look(self._view, share, gradient, weigh=gathers)
         self._steps += 1
         rates = rates_of(self.task, share, self.count)
-        if self._steps % options.every == 1 or options.every == 1:
+        if gathers:
             self.gather(self._view, 1.0)
-            self._solver.factorize(
-                self.blocks, self.mean_factor / options.length,
+            blocks = self.blocks.of_appearance() if options.colors_only else self.blocks
+            self._inverse = gn.invert(
+                blocks, self.mean_factor / options.length,
                 self.ridge(rates, gradient, options.ridge))
         if options.colors_only:
             self._adam(gradient, rates)
             return
         self._mean *= np.float32(options.momentum)
         self._mean += np.float32(1 - options.momentum) * gradient
-        step = self._solver.solve(self._mean)
+        step = self._inverse.multiply(self._mean)
         bound = np.float32(options.most) * rates
         self.values -= np.clip(step, -bound, bound)
 
@@ -228,7 +230,7 @@ class BlockNewton(Method):
         adam.step(arrays[0], arrays[1], (arrays[2], arrays[3]),
                   [float(part[0]) for part in gn.parts(rates)], count=self._steps,
                   betas=(momentum, 0.999), epsilon=EPSILON)
-        step = self._solver.solve(self._mean)
+        step = self._inverse.multiply(self._mean)
         bound = np.float32(self.options.most) * rates
         for to, start, change, most in list(zip(*map(
                 gn.parts, (self.values, before, step, bound)), strict=True))[3:]:
@@ -293,9 +295,9 @@ METHODS: dict[str, Callable[[Task, Splats, int], Method]] = {
 @workspace_argument
 @click.option("--max-size", default=320, show_default=True)
 @click.option("--max-gaussians", default=20_000, show_default=True)
-@click.option("--start", "start_steps", default=300, show_default=True,
+@click.option("--start", "start_steps", default=200, show_default=True,
               help="Steps of the recipe's run that the start is taken from.")
-@click.option("--steps", default="100,200,400,800", show_default=True, help="Lengths of Adam's.")
+@click.option("--steps", default="50,100,200,400", show_default=True, help="Lengths of Adam's.")
 @click.option("--methods", default=",".join(METHODS), show_default=True)
 @click.option("--share", default=0.7, show_default=True,
               help="CPU seconds of the others, of those of Adam's longest run.")

@@ -86,21 +86,26 @@ class LinearizedView:
         self._all_last = self._pass.last
         return self._image
 
-    def compare(self, view: TrainView, ssim_weight: float) -> Vector:
-        """Returns the gradient of the loss by the render; fills `loss`, and the weights W."""
+    def compare(self, view: TrainView, ssim_weight: float, *, weigh: bool = True) -> Vector:
+        """Returns the gradient of the loss by the render; fills `loss`, and W if it is asked for.
+
+        W is the diagonal `weights` [H * W * 3].
+        """
         rgb, take = self._image, self._pass.take
         truth = np.array(view.image.reshape(-1))
-        photo = truth * np.float32(1 / 255)
         ignored = None if view.mask is None else np.repeat(~view.mask.reshape(-1), 3)
         if ignored is not None:
-            rgb[ignored] = photo[ignored]
+            rgb[ignored] = truth[ignored] * np.float32(1 / 255)
         gradient = take("grad_rgb", len(rgb))
         self.loss = photometric(
             rgb, truth, self._camera.width, self._camera.height, ssim_weight,
             maps=take("maps", MAPS * len(rgb)), gradient=gradient)
-        self.weights = self._weigh(photo, ssim_weight)
+        if weigh:
+            self.weights = self._weigh(truth * np.float32(1 / 255), ssim_weight)
         if ignored is not None:
-            gradient[ignored], self.weights[ignored] = 0, 0
+            gradient[ignored] = 0
+            if weigh:
+                self.weights[ignored] = 0
         return gradient
 
     def _weigh(self, photo: Vector, ssim_weight: float) -> Vector:
@@ -169,6 +174,14 @@ class Blocks:
         self.geometry *= np.float32(factor)
         self.colors *= np.float32(factor)
 
+    def of_appearance(self) -> Blocks:
+        """Returns the entries of opacities and colours alone, zeros elsewhere."""
+        result = Blocks(len(self.colors) // 3)
+        last = slice(block_kernels.TRIANGLE - 1, None, block_kernels.TRIANGLE)
+        result.geometry[last] = self.geometry[last]
+        result.colors = self.colors
+        return result
+
     def multiply(self, vector: Vector) -> Vector:
         """Returns the product with a vector."""
         result = vector.copy()
@@ -177,27 +190,19 @@ class Blocks:
         return result
 
 
-class BlockSolver:
-    """Solves scale * blocks + diag(ridge), factorized once."""
+def invert(blocks: Blocks, scale: float, ridge: Vector) -> Blocks:
+    """Returns the inverse of scale * blocks + diag(ridge).
 
-    def __init__(self, n: int) -> None:
-        self._factors = np.empty(n * block_kernels.TRIANGLE, np.float32)
-
-    def factorize(self, blocks: Blocks, scale: float, ridge: Vector) -> None:
-        """Takes a matrix; `ridge` is a vector like that of the parameters, positive."""
-        *rows, colors = parts(ridge)
-        n = len(colors) // 3
-        diagonal = np.concatenate([row.reshape(n, -1) for row in rows], axis=1).reshape(-1)
-        pool.run(block_kernels.factorize, blocks.geometry, scale, diagonal, self._factors,
-                 scratch=False)
-        self._colors = 1 / (np.float32(scale) * blocks.colors + colors)
-
-    def solve(self, vector: Vector) -> Vector:
-        """Returns the solution of a right side."""
-        result = vector.copy()
-        pool.run(block_kernels.solve_blocks, self._factors, *geometry(result), scratch=False)
-        parts(result)[4][:] *= self._colors
-        return result
+    `ridge` is a vector like that of the parameters, positive.
+    """
+    *rows, colors = parts(ridge)
+    n = len(colors) // 3
+    diagonal = np.concatenate([row.reshape(n, -1) for row in rows], axis=1).reshape(-1)
+    inverse = Blocks(n)
+    pool.run(block_kernels.invert, blocks.geometry, scale, diagonal, inverse.geometry,
+             scratch=False)
+    inverse.colors = 1 / (np.float32(scale) * blocks.colors + colors)
+    return inverse
 
 
 def dot(one: Vector, other: Vector) -> float:

@@ -114,12 +114,12 @@ def test_blocks_are_the_curvature_of_single_gaussians(linear):
     assert seen > N
 
 
-def test_the_solver_inverts_blocks_with_a_ridge(linear):
-    blocks, solver, change = gn.Blocks(N), gn.BlockSolver(N), a_change(4)
+def test_blocks_with_a_ridge_are_inverted(linear):
+    blocks, change = gn.Blocks(N), a_change(4)
     linear.add_blocks(1.0, blocks.geometry, blocks.colors)
     ridge = np.full_like(change, 0.5)
-    solver.factorize(blocks, 2.0, ridge)
-    again = solver.solve(2 * blocks.multiply(change) + ridge * change)
+    inverse = gn.invert(blocks, 2.0, ridge)
+    again = inverse.multiply(2 * blocks.multiply(change) + ridge * change)
     assert np.abs(again - change).max() < 1e-2 * np.abs(change).max()
 
 
