@@ -209,7 +209,7 @@ class BlockNewton(Method):
         rates = rates_of(self.task, share, self.count)
         if gathers:
             self.gather(self._view, 1.0)
-            blocks = self.blocks.of_appearance() if options.colors_only else self.blocks
+            blocks = self.blocks.select_appearance() if options.colors_only else self.blocks
             self._inverse = gn.invert(
                 blocks, self.mean_factor / options.length,
                 self.ridge(rates, gradient, options.ridge))

@@ -174,7 +174,7 @@ class Blocks:
         self.geometry *= np.float32(factor)
         self.colors *= np.float32(factor)
 
-    def of_appearance(self) -> Blocks:
+    def select_appearance(self) -> Blocks:
         """Returns the entries of opacities and colours alone, zeros elsewhere."""
         result = Blocks(len(self.colors) // 3)
         last = slice(block_kernels.TRIANGLE - 1, None, block_kernels.TRIANGLE)
