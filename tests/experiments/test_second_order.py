@@ -15,6 +15,8 @@ from recon_cli.scene.train_view import TrainView
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 import gauss_newton as gn
 
+pytestmark = pytest.mark.compile  # half a minute, once
+
 N = 40
 CAMERA = camera_at(70, 45)
 GREY = np.full(3, 0.3, np.float32)
