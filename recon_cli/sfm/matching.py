@@ -234,8 +234,8 @@ def _match_descriptors(job: MappingJob, pairs: Sequence[Pair]) -> None:
     """Writes the matches of pairs into the database, but those that are there."""
     with pycolmap.Database.open(job.database) as opened, ThreadPoolExecutor(job.threads) as pool:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
-        numbers = [(ids[name], ids[other]) for name, other in pairs]
-        rest = sorted((min(pair), max(pair)) for pair in numbers if not opened.exists_matches(*pair))
+        numbers = sorted(tuple(sorted((ids[name], ids[other]))) for name, other in pairs)
+        rest = [pair for pair in numbers if not opened.exists_matches(*pair)]
         descriptors = {number: np.asarray(opened.read_descriptors(number).data, np.uint8)
                        for number in sorted(set(itertools.chain(*rest)))}
         found = pool.map(lambda pair: match_descriptors(*(descriptors[i] for i in pair)), rest)
