@@ -250,7 +250,7 @@ def triangulation_angles(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     points = list(model.points3D.values())
     places = np.array([point.xyz for point in points]).reshape(-1, 3)
-    lengths = np.array([point.track.length() for point in points])
+    lengths = np.array([point.track.length() for point in points], np.int64)
     seen_from = np.array([
         centers[element.image_id] for point in points for element in point.track.elements])
     rays = seen_from.reshape(-1, 3) - np.repeat(places, lengths, axis=0)
