@@ -248,11 +248,19 @@ def list_registered(model: pycolmap.Reconstruction) -> list[str]:
 def triangulation_angles(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     """Returns the widest angle between two rays to each point, [P], degrees."""
     centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
-    angles = np.empty(model.num_points3D())
-    for row, point in enumerate(model.points3D.values()):
-        rays = np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles[row] = np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))
+    points = list(model.points3D.values())
+    places = np.array([point.xyz for point in points]).reshape(-1, 3)
+    lengths = np.array([point.track.length() for point in points], np.int64)
+    seen_from = np.array([
+        centers[element.image_id] for point in points for element in point.track.elements])
+    rays = seen_from.reshape(-1, 3) - np.repeat(places, lengths, axis=0)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    start = np.cumsum(lengths) - lengths
+    angles = np.empty(len(points))
+    for length in np.unique(lengths):
+        own = np.flatnonzero(lengths == length)
+        each = rays[start[own][:, None] + np.arange(length)]  # [points of this length, length, 3]
+        angles[own] = np.arccos(np.clip((each @ each.transpose(0, 2, 1)).min(axis=(1, 2)), -1, 1))
     return np.degrees(angles)
 
 

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,25 +52,29 @@ def find_fisheyes(job: MappingJob) -> dict[int, float]:
         return {}
     samples, found = _read_samples(job), {}
     for number, group in unknown.items():
-        focal = _find_focal(group, samples.get(number, []), seed=job.seed)
+        focal = _find_focal(
+            group, samples.get(number, []), seed=job.seed, threads=job.threads)
         if focal is not None:
             found[number] = focal
     return found
 
 
-def _find_focal(group: CameraGroup, samples: list[Sample], *, seed: int) -> float | None:
+def _find_focal(
+    group: CameraGroup, samples: list[Sample], *, seed: int, threads: int
+) -> float | None:
     """Returns the focal length in pixels of a fisheye; None where it is an ordinary lens."""
     side, named = max(group.width, group.height), group.model != "auto"
     if sum(len(ours) for ours, _ in samples) < _LEAST_MATCHES and not named:
         return None
 
     def most(model: str, shares: tuple[float, ...]) -> tuple[int, float]:
-        return max((sum(count_explained(
-            _camera(group, model, share * side), sample, seed=seed) for sample in samples),
+        return max((sum(pool.map(
+            partial(count_explained, _camera(group, model, share * side), seed=seed), samples)),
             share * side) for share in shares)
 
-    count, focal = most(FISHEYE, FOCALS)
-    clear = named or count > CLEARLY * most(ORDINARY, ORDINARY_FOCALS)[0]
+    with ThreadPoolExecutor(threads) as pool:
+        count, focal = most(FISHEYE, FOCALS)
+        clear = named or count > CLEARLY * most(ORDINARY, ORDINARY_FOCALS)[0]
     return focal if clear else None
 
 

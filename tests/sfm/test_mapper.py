@@ -13,20 +13,28 @@ pytestmark = pytest.mark.floors
 
 
 def test_the_angle_of_a_point_is_that_of_its_widest_pair_of_rays():
-    """Cameras at x = 0, 1 and 2 see a point one unit before the first: 0, 45 and 63.4 degrees."""
+    """Cameras at x = 0, 1 and 2 see points one unit before the first: 0, 45 and 63.4 degrees."""
     model = pycolmap.Reconstruction()
+    assert triangulation_angles(model).shape == (0,)
     model.add_camera_with_trivial_rig(pycolmap.Camera(
         camera_id=1, model="PINHOLE", width=8, height=6, params=[5, 5, 4, 3]))
-    track = pycolmap.Track()
+    seen_by = [(0, 1, 2), (0, 1), (1, 2), (2, 1, 0)]
     for x in range(3):
         model.add_image_with_trivial_frame(
             pycolmap.Image(
                 image_id=x + 1, name=f"{x}.png", camera_id=1,
-                points2D=[pycolmap.Point2D(np.zeros(2))]),
+                points2D=[pycolmap.Point2D(np.zeros(2)) for _ in seen_by]),
             pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-float(x), 0, 0])))
-        track.add_element(x + 1, 0)
-    model.add_point3D(np.array([0.0, 0, 1]), track)
-    assert triangulation_angles(model) == pytest.approx([np.degrees(np.arctan(2))])
+    widest = float(np.degrees(np.arctan(2)))
+    expected = {}
+    for row, places in enumerate(seen_by):
+        track = pycolmap.Track()
+        for x in places:
+            track.add_element(x + 1, row)
+        number = model.add_point3D(np.array([0.0, 0, 1]), track)
+        expected[number] = [widest, 45, widest - 45, widest][row]
+    found = dict(zip(model.points3D, triangulation_angles(model).tolist(), strict=True))
+    assert found == pytest.approx(expected)
 
 
 def shifted(model, camera):
