@@ -23,6 +23,7 @@ from unittest.mock import patch
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 from workbench import (
     numba_context,
     open_scene,
@@ -113,13 +114,19 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
 
 
 def without_stretches(scene: Scene) -> tuple[Scene, SparseModel]:
-    """Returns the scene without stretches of its training views, whose middle is validated.
+    """Returns the scene without stretches of its training views, whose middle is validated."""
+    place = np.arange(len(scene.train)) % EVERY - (EVERY // 2 - 1)
+    return take_away(scene, np.abs(place) <= GAP // 2, np.abs(place) <= MIDDLE // 2)
+
+
+def take_away(
+    scene: Scene, away: NDArray[np.bool_], scored: NDArray[np.bool_]
+) -> tuple[Scene, SparseModel]:
+    """Returns the scene without some of its training views by name, some of which are validated.
 
     The rows of a sparse model change with the points that go.
     """
     views = sorted(scene.train, key=lambda view: view.name)
-    place = np.arange(len(views)) % EVERY - (EVERY // 2 - 1)
-    away, scored = (np.abs(place) <= count // 2 for count in (GAP, MIDDLE))
     train = tuple(view for view, gone in zip(views, away, strict=True) if not gone)
     sees = observe_points(scene.points, [view.camera for view in train])
     kept = np.bincount(sees.point, minlength=len(scene.points)) >= SEES
