@@ -221,6 +221,12 @@ class TrainConfig(StageConfig):
     exposure: str = option(
         "auto", "A gain per image; auto: by trial.",
         choices=("auto", "on", "off"))
+    vignette: str = option(
+        "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
+        choices=("auto", "on", "off"), late=True, expert=True)
+    tone: str = option(
+        "auto", "A tone curve per image; auto: by a trial.",
+        choices=("auto", "on", "off"), late=True, expert=True)
     depth: str = option(
         "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
         "budget, unless a trial shows a loss.",

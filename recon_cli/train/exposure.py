@@ -27,10 +27,14 @@ _PREFIX = "exposure"
 class Exposure:
     """The log-gains of all training images and their optimizer; `start` [F, 3] gets a mean of 0."""
 
-    def __init__(self, images: int, *, start: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, images: int, *, start: NDArray[np.float64] | None = None,
+                 shared: NDArray[np.float64] | None = None) -> None:
         first = np.zeros((images, 3)) if start is None else start
         if first.shape != (images, 3):
             raise ValueError(f"log-gains of shape {first.shape}, needed {(images, 3)}")
+        if shared is not None:
+            first = first - shared @ (shared.T @ first)
+        self._shared = None if shared is None else torch.from_numpy(shared)
         self._rows = SparseAdam(torch.from_numpy(first - first.mean(axis=0)))
 
     @property
@@ -48,7 +52,10 @@ class Exposure:
         The rate falls as `done` goes from 0 to 1.
         """
         self._rows.step(image, gradient, _RATE * (_FINAL_RATE / _RATE) ** done)
-        self._rows.center()
+        if self._shared is None:
+            self._rows.center()
+        else:
+            self._rows.value -= self._shared @ (self._shared.T @ self._rows.value)
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns gains, moments and counts by name, for a checkpoint."""
@@ -107,10 +114,8 @@ def estimate_gains(
     Weighted least squares over pairs: the median log-ratio of the points that two views share
     should be the difference of their log-gains. Of more than 4,000 points a seeded draw is taken.
     """
-    if len(points) > _POINTS:
-        chosen = np.random.default_rng(seed).permutation(len(points))[:_POINTS]
-        points = points[np.sort(chosen)]
-    logs = np.stack([_log_colors(view, points) for view in views])
+    points = choose_points(points, seed)
+    logs = np.stack([log_colors(view, points) for view in views])
     pairs, medians, weights = _pairs(logs)
     known = np.unique(pairs)
     if len(known) == 0:
@@ -122,7 +127,14 @@ def estimate_gains(
                     float(apart / max(2 * variance, 1e-12)), len(pairs))
 
 
-def _log_colors(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64]:  # [P, 3]
+def choose_points(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
+    """Returns the points [P, 3], of more than 4,000 a seeded draw."""
+    if len(points) <= _POINTS:
+        return points
+    return points[np.sort(np.random.default_rng(seed).permutation(len(points))[:_POINTS])]
+
+
+def log_colors(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64]:  # [P, 3]
     """Returns the logarithm of each point's colour; NaN where it is not seen or may be clipped."""
     image, block = _reduce(view)
     rows, column, line = project_points(view.camera, points)
@@ -194,3 +206,21 @@ def _solve(
         # of the least norm: of mean 0 in each part that hangs together
         gains[:, channel] = np.linalg.lstsq(normal, right, rcond=1e-10)[0]
     return gains
+
+
+def shared_brightness(
+    views: Sequence[TrainView],
+    points: NDArray[np.float64],  # [P, 3]
+    *, least: float, seed: int = 0,
+) -> NDArray[np.float64]:
+    """Returns an orthonormal basis [F, K] of the changes that views of the same place share."""
+    points = choose_points(points, seed)
+    seen = np.isfinite(np.stack([log_colors(view, points)[:, 0] for view in views]))
+    seen = seen.astype(np.float64)
+    by_view, by_point = (np.maximum(seen.sum(axis=axis), 1) for axis in (1, 0))
+    root = np.sqrt(by_view)
+    passed = (seen / by_point) @ seen.T / (root[:, None] * root)
+    values, vectors = np.linalg.eigh(passed)
+    followed = vectors[:, values > least] / root[:, None]
+    ones = np.ones((len(views), 1))
+    return np.asarray(np.linalg.qr(np.hstack([ones, followed]))[0])

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
+from recon_cli.render.response import LensFalloffs
 from recon_cli.scene.motion import Motion
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
@@ -42,8 +43,10 @@ from recon_cli.train.moving_search import (
     share_of,
     shows_movement,
 )
+from recon_cli.train.photometric_evidence import PhotometricEvidence, find_photometry
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.shutter import BlurEvidence, ViewMotions
+from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 from recon_cli.workspace.summaries import TrialDecision
 
@@ -135,7 +138,7 @@ _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
-PARTS = ("far", "stereo", "exposure", "images", "depth", "blur")
+PARTS = ("far", "stereo", "exposure", "vignette", "tone", "images", "depth", "blur")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
@@ -203,6 +206,11 @@ def examine(scene: TrialScene) -> Needs:
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
+    light = bench.light(config)
+    settle("vignette", "on" if light.shades else None,
+           f"the corners of the views lack {100 * light.corner_loss:.1f}% of the light only")
+    settle("tone", "on" if light.bends_differ else None,
+           f"tone curves of the views differ by {100 * light.bend_spread:.1f}% only")
     if config.depth == "auto" and not (scene.task.has_depth or scene.task.depth_refused):
         config = replace(config, depth="off")
     settle("depth", "on" if scene.task.has_depth else None, scene.task.depth_refused)
@@ -247,6 +255,13 @@ class _Bench:
                      else BlurEvidence.nothing())
         self._scores: dict[tuple[object, ...], list[float]] = {}
         self._models: dict[tuple[object, ...], Splats] = {}
+
+    def light(self, config: RunConfig) -> PhotometricEvidence:
+        """Returns what the points show of vignettes and tone curves, where options ask for it."""
+        task = self._scene.task
+        if "auto" not in (config.vignette, config.tone):
+            return PhotometricEvidence.nothing(task.train)
+        return find_photometry(task.train, self._scene.points)
 
     def shutter(self, config: RunConfig) -> float | None:
         """Returns the shutter time in seconds that explains views best; None without evidence.
@@ -352,14 +367,16 @@ class _Bench:
             return self._score(splats, held_out, config)
 
         return decide("moving", (
-            lambda: score(model), lambda: score(self._fit(config, [masked[row] for row in rows]))),
+            lambda: score(model),
+            lambda: score(self._fit(config, [masked[row] for row in rows]).splats)),
             unless_worse=True)
 
     def _probe(self, config: RunConfig, views: Sequence[TrainView], side: int) -> Splats:
         """Returns a model of views reduced to `side` pixels, and of as many more Gaussians."""
         finer = side / SIDE
         largest = max(max(view.camera.width, view.camera.height) for view in views)
-        return self._fit(self._short(config, finer), views, factor=max(1.0, largest / side))
+        return self._fit(
+            self._short(config, finer), views, factor=max(1.0, largest / side)).splats
 
     def _telling(self, part: str) -> list[int]:
         """Returns which held-out views can tell whether a part pays; the others only add noise."""
@@ -397,26 +414,29 @@ class _Bench:
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         motions = scene.task.motions and scene.task.motions.select(rows)
-        splats = self._fit(config, [train[i] for i in rows], factor=level, motions=motions)
-        return splats, self._score(splats, held_out, config, level, self._held_out_motions(config))
+        state = self._fit(config, [train[i] for i in rows], factor=level, motions=motions)
+        falloffs = None if state.photometry is None else state.photometry.falloffs
+        return state.splats, self._score(
+            state.splats, held_out, config, level, self._held_out_motions(config), falloffs)
 
     def _score(
         self, splats: Splats, views: Sequence[TrainView], config: RunConfig, level: int = LEVEL,
-        motions: Sequence[Motion | None] = (),
+        motions: Sequence[Motion | None] = (), falloffs: LensFalloffs | None = None,
     ) -> list[float]:
         """Returns the corrected PSNR in dB of each view, blurred by its motion where it has one."""
         task, degree = self._scene.task, config.sh_degree
         small = [reduce_view(view, level) for view in views]
         return [
-            mean_psnr(splats, [view], degree, task.backend, corrected=True) if motion is None
+            mean_psnr(splats, [view], degree, task.backend, corrected=True, falloffs=falloffs)
+            if motion is None
             else blurred_psnr(splats, view, motion, replace(task, schedule=Schedule(config)))
             for view, motion in zip(small, motions or [None] * len(small), strict=True)]
 
     def _fit(
         self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL,
         motions: ViewMotions | None = None,
-    ) -> Splats:
-        """Returns the Gaussians of a short run on views reduced by a factor."""
+    ) -> TrainState:
+        """Returns the end of a short run on views reduced by a factor."""
         scene, task = self._scene, self._scene.task
         # Far content seemed worth up to 1 dB less where a run so short replaced Gaussians, too; in
         # runs of full length it is worth as much as without (tests/bench/notes/training.md).
@@ -430,7 +450,7 @@ class _Bench:
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, config.iterations)
-        return state.splats
+        return state
 
     def _held_out_motions(self, config: RunConfig) -> Sequence[Motion | None]:
         """Returns the motions of the views to score; None for those that are scored as sharp."""

@@ -16,6 +16,7 @@ from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
+from recon_cli.train.photometry import Curves, Photometry, Vignettes
 from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.stereo_points import SurfacePoints
 from recon_cli.train.task import Task
@@ -96,7 +97,7 @@ def first_state(
         backdrop=Backdrop.behind(grey, centers) if grey else None)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
-        backend=task.backend, exposure=new_exposure(task, gains))
+        backend=task.backend, photometry=new_photometry(task, gains))
 
 
 def surfaces_of(task: Task, sparse: int) -> SurfacePoints:
@@ -120,14 +121,14 @@ def restore_state(path: Path, task: Task) -> TrainState:
     """
     return load_state(
         path, task.schedule.config, task.means_unit, task.device, backend=task.backend,
-        exposure=new_exposure(task))
+        photometry=new_photometry(task))
 
 
 def begin_state(splats: Splats, task: Task) -> TrainState:
     """Returns the state before the first step of a run that begins with these Gaussians."""
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.means_unit,
-        backend=task.backend, exposure=new_exposure(task))
+        backend=task.backend, photometry=new_photometry(task))
 
 
 def make_finished_state(splats: Splats, task: Task) -> TrainState:
@@ -140,12 +141,15 @@ def make_finished_state(splats: Splats, task: Task) -> TrainState:
     return state
 
 
-def new_exposure(
+def new_photometry(
     task: Task, log_gains: NDArray[np.float64] | None = None
-) -> Exposure | None:
-    """Returns the gains of the training images before any step; None unless they are fitted."""
-    on = task.schedule.config.exposure == "on"
-    return Exposure(len(task.train), start=log_gains) if on else None
+) -> Photometry | None:
+    """Returns the photometry of the training images before any step; None unless any is fitted."""
+    config, images = task.schedule.config, len(task.train)
+    return Photometry.from_parts(
+        Exposure(images, start=log_gains) if config.exposure == "on" else None,
+        Curves(images) if config.tone == "on" else None,
+        Vignettes([view.camera for view in task.train]) if config.vignette == "on" else None)
 
 
 def first_splats(
