@@ -248,7 +248,7 @@ class _Bench:
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
                     else FarContent.nothing())
         drifting = task.schedule.config.exposure != "off"
-        self.drift = (estimate_gains(task.train, scene.points) if drifting
+        self.drift = (estimate_gains(task.train, scene.points, exposures=task.exposures) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))
         self.blur = (task.motions.find_blur(task.train)
                      if task.motions is not None and task.schedule.config.blur != "off"
@@ -414,7 +414,9 @@ class _Bench:
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
         rows, held_out = self._views()  # scored against the task's own, whatever was trained on
         motions = scene.task.motions and scene.task.motions.select(rows)
-        state = self._fit(config, [train[i] for i in rows], factor=level, motions=motions)
+        exposures = None if scene.task.exposures is None else scene.task.exposures[list(rows)]
+        state = self._fit(config, [train[i] for i in rows], factor=level, motions=motions,
+                          exposures=exposures)
         falloffs = None if state.photometry is None else state.photometry.falloffs
         return state.splats, self._score(
             state.splats, held_out, config, level, self._held_out_motions(config), falloffs)
@@ -434,7 +436,7 @@ class _Bench:
 
     def _fit(
         self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL,
-        motions: ViewMotions | None = None,
+        motions: ViewMotions | None = None, exposures: NDArray[np.float64] | None = None,
     ) -> TrainState:
         """Returns the end of a short run on views reduced by a factor."""
         scene, task = self._scene, self._scene.task
@@ -446,7 +448,7 @@ class _Bench:
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(view, factor) for view in views], [], schedule, task.extent,
                      task.backend, task.device, nearness=task.nearness, stereo=task.stereo,
-                     motions=motions)
+                     motions=motions, exposures=exposures)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, config.iterations)

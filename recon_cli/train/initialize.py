@@ -80,7 +80,8 @@ def first_state(
         far = None
     elif far is None:
         far = far_content(task.train, points, task.extent)
-    gains = estimate_gains(task.train, points).log_gains if config.exposure == "on" else None
+    gains = estimate_gains(
+        task.train, points, exposures=task.exposures).log_gains if config.exposure == "on" else None
     sparse = len(points)
     surfaces = surfaces_of(task, sparse)
     points = np.concatenate([points, surfaces.points])
