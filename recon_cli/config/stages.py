@@ -219,8 +219,8 @@ class TrainConfig(StageConfig):
         "out; auto: on.",
         choices=("auto", "on", "off"), expert=True)
     exposure: str = option(
-        "auto", "A gain per image; auto: by trial.",
-        choices=("auto", "on", "off"))
+        "auto", "A gain per image; early: then as filmed.",
+        choices=("auto", "on", "early", "off"))
     vignette: str = option(
         "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
         choices=("auto", "on", "off"), late=True, expert=True)
@@ -337,7 +337,8 @@ class RunConfig(SettledConfig):
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
                  "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
                  "sh_rate")
-        return self.densify == "reference" and self.depth != "on" and all(
+        return self.densify == "reference" and (
+            "on" not in (self.depth, self.vignette, self.tone)) and all(
             getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 

@@ -306,8 +306,8 @@ class Runner:
         points = run_trial(loaded, run, score_at, on_step=on_step)
         config = loaded.task(run).schedule.config
         parts = [f"{config.images} images", f"degree {config.sh_degree}",
-                 *(name for name in ("far", "stereo", "exposure", "depth")
-                   if getattr(config, name) == "on")]
+                 *(name for name in ("far", "stereo", "exposure", "vignette", "tone", "depth")
+                   if getattr(config, name) in ("on", "early"))]
         record = Record(points, self._machine, ", ".join(parts))
         if self._records:
             self._records.add_run(key_of(loaded, run), record, run, loaded.folders.name)

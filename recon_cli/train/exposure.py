@@ -28,14 +28,10 @@ _PREFIX = "exposure"
 class Exposure:
     """The log-gains of all training images and their optimizer; `start` [F, 3] gets a mean of 0."""
 
-    def __init__(self, images: int, *, start: NDArray[np.float64] | None = None,
-                 shared: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, images: int, *, start: NDArray[np.float64] | None = None) -> None:
         first = np.zeros((images, 3)) if start is None else start
         if first.shape != (images, 3):
             raise ValueError(f"log-gains of shape {first.shape}, needed {(images, 3)}")
-        if shared is not None:
-            first = first - shared @ (shared.T @ first)
-        self._shared = None if shared is None else torch.from_numpy(shared)
         self._rows = SparseAdam(torch.from_numpy(first - first.mean(axis=0)))
 
     @property
@@ -53,10 +49,7 @@ class Exposure:
         The rate falls as `done` goes from 0 to 1.
         """
         self._rows.step(image, gradient, _RATE * (_FINAL_RATE / _RATE) ** done)
-        if self._shared is None:
-            self._rows.center()
-        else:
-            self._rows.value -= self._shared @ (self._shared.T @ self._rows.value)
+        self._rows.center()
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns gains, moments and counts by name, for a checkpoint."""
@@ -256,21 +249,3 @@ def _trusted(
         if own.any() and np.median(misses[best][own]) > _DOUBT:
             nominal[view] = np.nan
     return np.asarray(nominal)
-
-
-def shared_brightness(
-    views: Sequence[TrainView],
-    points: NDArray[np.float64],  # [P, 3]
-    *, least: float, seed: int = 0,
-) -> NDArray[np.float64]:
-    """Returns an orthonormal basis [F, K] of the changes that views of the same place share."""
-    points = choose_points(points, seed)
-    seen = np.isfinite(np.stack([log_colors(view, points)[:, 0] for view in views]))
-    seen = seen.astype(np.float64)
-    by_view, by_point = (np.maximum(seen.sum(axis=axis), 1) for axis in (1, 0))
-    root = np.sqrt(by_view)
-    passed = (seen / by_point) @ seen.T / (root[:, None] * root)
-    values, vectors = np.linalg.eigh(passed)
-    followed = vectors[:, values > least] / root[:, None]
-    ones = np.ones((len(views), 1))
-    return np.asarray(np.linalg.qr(np.hstack([ones, followed]))[0])

@@ -176,6 +176,10 @@ class TrialScene:
 def examine(scene: TrialScene) -> Needs:
     """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     config = scene.task.schedule.config
+    if config.densify == "reference":  # sees what tables of the literature saw
+        for part in ("vignette", "tone"):
+            if getattr(config, part) == "auto":
+                config = _with(config, part, "off")
     if config.stereo == "auto":
         config = replace(config, stereo="on")
     bench = _Bench(scene)
@@ -189,7 +193,7 @@ def examine(scene: TrialScene) -> Needs:
         decision = (
             skip_trial(part, against) if sign is None else bench.try_part(part, config, sign))
         decisions.append(decision)
-        config = _with(config, part, _word(part, on=decision.on))
+        config = _with(config, part, sign if sign and decision.on else _word(part, on=False))
 
     if config.images == "auto" and scene.twins is None:
         config = replace(config, images="original")
@@ -203,9 +207,9 @@ def examine(scene: TrialScene) -> Needs:
             reason="one exposure for all is asked for, and brightness of the same points differs "
             f"by {100 * drift.spread:.1f}%"))
         config = replace(config, exposure=_word("exposure", on=drift.drifts))
-    settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
-           f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
-               ", but little between views of the same place" if drift.drifts else " only"))
+    # Gaussians take an exposure that follows the place: it is theirs again before the run ends
+    settle("exposure", None if not drift.drifts else "early" if drift.follows_place else "on",
+           f"brightness of the same points differs by {100 * drift.spread:.1f}% only")
     light = bench.light(config)
     settle("vignette", "on" if light.shades else None,
            f"the corners of the views lack {100 * light.corner_loss:.1f}% of the light only")
@@ -254,7 +258,7 @@ class _Bench:
                      if task.motions is not None and task.schedule.config.blur != "off"
                      else BlurEvidence.nothing())
         self._scores: dict[tuple[object, ...], list[float]] = {}
-        self._models: dict[tuple[object, ...], Splats] = {}
+        self._states: dict[tuple[object, ...], TrainState] = {}
 
     def light(self, config: RunConfig) -> PhotometricEvidence:
         """Returns what the points show of vignettes and tone curves, where options ask for it."""
@@ -291,7 +295,10 @@ class _Bench:
             return skip_trial(part, "too few of the views to score see any of it")
 
         def scores(config: RunConfig) -> list[float]:
-            values = self._run(config, self._blur_level if part == "blur" else LEVEL)
+            level = self._blur_level if part == "blur" else LEVEL
+            values = self._run(config, level)
+            if value == "early":  # the brightness as filmed counts as much as all else
+                values = np.mean([values, self._run(config, level, as_is=True)], axis=0).tolist()
             return [values[i] for i in telling]
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
@@ -327,7 +334,7 @@ class _Bench:
             return None
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
         self._run(config)
-        model = self._models[_key(config)]
+        model = self._states[_key(config)].splats
         if config.moving == "auto" and not shows_movement(model, views, judge):
             decisions.append(replace(skip_trial("moving", "no views contradict the others"),
                                      seconds=time.perf_counter() - start))
@@ -393,12 +400,20 @@ class _Bench:
         held_out = task.train if chosen.own else task.validation
         return chosen.train, [held_out[i] for i in chosen.held_out]
 
-    def _run(self, config: RunConfig, level: int = LEVEL) -> list[float]:
-        """Returns the corrected PSNR in dB of each held-out view after a short run."""
-        key = _key(config, level)
-        if key not in self._scores:
-            self._models[key], self._scores[key] = self._train(self._short(config), level)
-        return self._scores[key]
+    def _run(
+        self, config: RunConfig, level: int = LEVEL, *, as_is: bool = False
+    ) -> list[float]:
+        """Returns the PSNR in dB of each held-out view after a short run, corrected or as it is.
+        """
+        key, short = _key(config, level), self._short(config)
+        if key not in self._states:
+            self._states[key] = self._train(short, level)
+        if (scored := (as_is, *key)) not in self._scores:
+            state = self._states[key]
+            self._scores[scored] = self._score(
+                state.splats, self._views()[1], short, level, self._held_out_motions(short),
+                None if state.photometry is None else state.photometry.falloffs, as_is=as_is)
+        return self._scores[scored]
 
     def _short(self, config: RunConfig, finer: float = 1.0) -> RunConfig:
         """Returns the options of a short run, of more steps and Gaussians by a factor."""
@@ -407,29 +422,28 @@ class _Bench:
             max_gaussians=min(config.max_gaussians, round(finer * _CAP)), early_stop=False,
             batch_views=1)
 
-    def _train(self, config: RunConfig, level: int) -> tuple[Splats, list[float]]:
+    def _train(self, config: RunConfig, level: int) -> TrainState:
         scene, train = self._scene, self._scene.task.train
         if scene.twins is not None and config.images == "denoised":
             train = [replace(twin, depth=view.depth)
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
-        rows, held_out = self._views()  # scored against the task's own, whatever was trained on
+        rows, _ = self._views()
         motions = scene.task.motions and scene.task.motions.select(rows)
         exposures = None if scene.task.exposures is None else scene.task.exposures[list(rows)]
-        state = self._fit(config, [train[i] for i in rows], factor=level, motions=motions,
-                          exposures=exposures)
-        falloffs = None if state.photometry is None else state.photometry.falloffs
-        return state.splats, self._score(
-            state.splats, held_out, config, level, self._held_out_motions(config), falloffs)
+        return self._fit(config, [train[i] for i in rows], factor=level, motions=motions,
+                         exposures=exposures)
 
     def _score(
         self, splats: Splats, views: Sequence[TrainView], config: RunConfig, level: int = LEVEL,
         motions: Sequence[Motion | None] = (), falloffs: LensFalloffs | None = None,
+        *, as_is: bool = False,
     ) -> list[float]:
         """Returns the corrected PSNR in dB of each view, blurred by its motion where it has one."""
         task, degree = self._scene.task, config.sh_degree
         small = [reduce_view(view, level) for view in views]
         return [
-            mean_psnr(splats, [view], degree, task.backend, corrected=True, falloffs=falloffs)
+            mean_psnr(
+                splats, [view], degree, task.backend, corrected=not as_is, falloffs=falloffs)
             if motion is None
             else blurred_psnr(splats, view, motion, replace(task, schedule=Schedule(config)))
             for view, motion in zip(small, motions or [None] * len(small), strict=True)]

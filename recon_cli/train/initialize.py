@@ -16,6 +16,7 @@ from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
+from recon_cli.train.photometric_evidence import find_photometry
 from recon_cli.train.photometry import Curves, Photometry, Vignettes
 from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.stereo_points import SurfacePoints
@@ -80,8 +81,7 @@ def first_state(
         far = None
     elif far is None:
         far = far_content(task.train, points, task.extent)
-    gains = estimate_gains(
-        task.train, points, exposures=task.exposures).log_gains if config.exposure == "on" else None
+    photometry = new_photometry(task, points)
     sparse = len(points)
     surfaces = surfaces_of(task, sparse)
     points = np.concatenate([points, surfaces.points])
@@ -98,7 +98,7 @@ def first_state(
         backdrop=Backdrop.behind(grey, centers) if grey else None)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
-        backend=task.backend, photometry=new_photometry(task, gains))
+        backend=task.backend, photometry=photometry)
 
 
 def surfaces_of(task: Task, sparse: int) -> SurfacePoints:
@@ -143,14 +143,25 @@ def make_finished_state(splats: Splats, task: Task) -> TrainState:
 
 
 def new_photometry(
-    task: Task, log_gains: NDArray[np.float64] | None = None
+    task: Task, points: NDArray[np.float64] | None = None
 ) -> Photometry | None:
-    """Returns the photometry of the training images before any step; None unless any is fitted."""
-    config, images = task.schedule.config, len(task.train)
+    """Returns the photometry of the training images before any step; None unless any is fitted.
+
+    It starts with what `points` [P, 3] show; without them with no gain, curve or vignette.
+    """
+    config, views = task.schedule.config, task.train
+    gains = bends = exponents = None
+    compensated = config.exposure in ("on", "early")
+    if points is not None and compensated:
+        gains = estimate_gains(views, points, exposures=task.exposures).log_gains
+    if points is not None and "on" in (config.tone, config.vignette):
+        evidence = find_photometry(views, points)
+        bends, exponents = evidence.bends, evidence.vignettes
     return Photometry.from_parts(
-        Exposure(images, start=log_gains) if config.exposure == "on" else None,
-        Curves(images) if config.tone == "on" else None,
-        Vignettes([view.camera for view in task.train]) if config.vignette == "on" else None)
+        Exposure(len(views), start=gains) if compensated else None,
+        Curves(len(views), start=bends) if config.tone == "on" else None,
+        Vignettes([view.camera for view in views], start=exponents)
+        if config.vignette == "on" else None)
 
 
 def first_splats(

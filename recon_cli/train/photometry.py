@@ -6,7 +6,9 @@ vignette takes nothing away at the principal point. None of it is part of the .p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,12 +19,33 @@ from recon_cli.render.response import LensFalloffs, Response, ResponseGradient, 
 from recon_cli.scene.camera import Camera
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.optimizer import SparseAdam
+from recon_cli.workspace.atomic import write_json
+from recon_cli.workspace.summaries import PhotometrySummary, VignetteSummary
 
 # Of bends and of the exponents of vignettes; both fall to a tenth as those of exposures do.
 _BEND_RATE, _VIGNETTE_RATE, _FALL = 0.003, 0.002, 0.1
 _MOST_BEND = 0.5  # of 1, at which a curve is flat at one end
 _DARKEST = 1.5  # of -(a + b): a corner with a fifth of the light, as of a fast lens wide open
 _ONES = np.ones(3, np.float32)
+
+
+def write_photometry(folder: Path, photometry: Photometry | None) -> None:
+    """Writes what was fitted beside a model, if anything was."""
+    if photometry is not None:
+        write_json(folder / PhotometrySummary.FILE, photometry.summarize().to_json())
+
+
+def read_falloffs(folder: Path) -> LensFalloffs | None:
+    """Returns the vignettes that were fitted with the model in a folder; None without any.
+
+    Raises:
+        ManifestError: the file is of another version.
+        FormatError: it is damaged.
+    """
+    found = PhotometrySummary.read(folder)
+    if found is None or not found.vignettes:
+        return None
+    return LensFalloffs({each.lens: (each.a, each.b) for each in found.vignettes})
 
 
 class Photometry:
@@ -42,29 +65,48 @@ class Photometry:
             return None
         return Photometry(exposure, curves, vignettes)
 
-    def response(self, image: int) -> Response:
-        """Returns the response of a training image."""
+    def response(self, image: int, *, own: bool = True) -> Response | None:
+        """Returns the response of a training image, None where it does nothing.
+
+        Without `own` it is that of the camera alone, without the image's own gain and tone curve.
+        """
+        exposure, curves = (self.exposure, self.curves) if own else (None, None)
+        if exposure is None and curves is None and self.vignettes is None:
+            return None
         return Response(
-            _ONES if self.exposure is None else self.exposure.gain(image),
+            _ONES if exposure is None else exposure.gain(image),
             None if self.vignettes is None else self.vignettes.of_image(image),
-            None if self.curves is None else self.curves.bend(image))
+            None if curves is None else curves.bend(image))
 
     @property
     def falloffs(self) -> LensFalloffs | None:
         """The vignettes by lens, None where they are not fitted."""
         return None if self.vignettes is None else self.vignettes.falloffs
 
-    def step(self, image: int, gradient: ResponseGradient, done: float) -> None:
-        """Moves the parameters of one image against their gradients.
+    def step(
+        self, image: int, gradient: ResponseGradient, done: float, *, own: bool = True
+    ) -> None:
+        """Moves the parameters of one image against their gradients; `own` as of `response`.
 
         The rates fall as `done` goes from 0 to 1.
         """
-        if self.exposure is not None:
+        if self.exposure is not None and own:
             self.exposure.step(image, gradient.log_gain, done)
-        if self.curves is not None:
+        if self.curves is not None and own:
             self.curves.step(image, gradient.bend, done)
         if self.vignettes is not None:
             self.vignettes.step(image, gradient.vignette, done)
+
+    def summarize(self) -> PhotometrySummary:
+        """Returns what was found, for records."""
+        falloffs = {} if self.falloffs is None else self.falloffs.exponents
+        return PhotometrySummary(
+            gain_spread=None if self.exposure is None else round(
+                float(self.exposure.log_gains.std(axis=0).max()), 4),
+            bend_spread=None if self.curves is None else round(float(self.curves.bends.std()), 4),
+            vignettes=tuple(
+                VignetteSummary(lens=key, a=a, b=b, corner=round(math.exp(a + b), 4))
+                for key, (a, b) in falloffs.items()))
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns all parameters, moments and counts by name, for a checkpoint."""
