@@ -219,8 +219,8 @@ class TrainConfig(StageConfig):
         "out; auto: on.",
         choices=("auto", "on", "off"), expert=True)
     exposure: str = option(
-        "auto", "A gain per image; early: then as filmed.",
-        choices=("auto", "on", "early", "off"))
+        "auto", "A gain per image; auto: by trial.",
+        choices=("auto", "on", "off"))
     vignette: str = option(
         "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
         choices=("auto", "on", "off"), late=True, expert=True)

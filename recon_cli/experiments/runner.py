@@ -307,7 +307,7 @@ class Runner:
         config = loaded.task(run).schedule.config
         parts = [f"{config.images} images", f"degree {config.sh_degree}",
                  *(name for name in ("far", "stereo", "exposure", "vignette", "tone", "depth")
-                   if getattr(config, name) in ("on", "early"))]
+                   if getattr(config, name) == "on")]
         record = Record(points, self._machine, ", ".join(parts))
         if self._records:
             self._records.add_run(key_of(loaded, run), record, run, loaded.folders.name)

@@ -193,7 +193,7 @@ def examine(scene: TrialScene) -> Needs:
         decision = (
             skip_trial(part, against) if sign is None else bench.try_part(part, config, sign))
         decisions.append(decision)
-        config = _with(config, part, sign if sign and decision.on else _word(part, on=False))
+        config = _with(config, part, _word(part, on=decision.on))
 
     if config.images == "auto" and scene.twins is None:
         config = replace(config, images="original")
@@ -207,9 +207,9 @@ def examine(scene: TrialScene) -> Needs:
             reason="one exposure for all is asked for, and brightness of the same points differs "
             f"by {100 * drift.spread:.1f}%"))
         config = replace(config, exposure=_word("exposure", on=drift.drifts))
-    # Gaussians take an exposure that follows the place: it is theirs again before the run ends
-    settle("exposure", None if not drift.drifts else "early" if drift.follows_place else "on",
-           f"brightness of the same points differs by {100 * drift.spread:.1f}% only")
+    settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
+           f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
+               ", but little between views of the same place" if drift.drifts else " only"))
     light = bench.light(config)
     settle("vignette", "on" if light.shades else None,
            f"the corners of the views lack {100 * light.corner_loss:.1f}% of the light only")
@@ -297,7 +297,7 @@ class _Bench:
         def scores(config: RunConfig) -> list[float]:
             level = self._blur_level if part == "blur" else LEVEL
             values = self._run(config, level)
-            if value == "early":  # the brightness as filmed counts as much as all else
+            if part in ("vignette", "tone"):  # brightness as filmed counts as much as all else
                 values = np.mean([values, self._run(config, level, as_is=True)], axis=0).tolist()
             return [values[i] for i in telling]
 

@@ -151,14 +151,13 @@ def new_photometry(
     """
     config, views = task.schedule.config, task.train
     gains = bends = exponents = None
-    compensated = config.exposure in ("on", "early")
-    if points is not None and compensated:
+    if points is not None and config.exposure == "on":
         gains = estimate_gains(views, points, exposures=task.exposures).log_gains
     if points is not None and "on" in (config.tone, config.vignette):
         evidence = find_photometry(views, points)
         bends, exponents = evidence.bends, evidence.vignettes
     return Photometry.from_parts(
-        Exposure(len(views), start=gains) if compensated else None,
+        Exposure(len(views), start=gains) if config.exposure == "on" else None,
         Curves(len(views), start=bends) if config.tone == "on" else None,
         Vignettes([view.camera for view in views], start=exponents)
         if config.vignette == "on" else None)

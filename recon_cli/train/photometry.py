@@ -65,34 +65,26 @@ class Photometry:
             return None
         return Photometry(exposure, curves, vignettes)
 
-    def response(self, image: int, *, own: bool = True) -> Response | None:
-        """Returns the response of a training image, None where it does nothing.
-
-        Without `own` it is that of the camera alone, without the image's own gain and tone curve.
-        """
-        exposure, curves = (self.exposure, self.curves) if own else (None, None)
-        if exposure is None and curves is None and self.vignettes is None:
-            return None
+    def response(self, image: int) -> Response:
+        """Returns the response of a training image."""
         return Response(
-            _ONES if exposure is None else exposure.gain(image),
+            _ONES if self.exposure is None else self.exposure.gain(image),
             None if self.vignettes is None else self.vignettes.of_image(image),
-            None if curves is None else curves.bend(image))
+            None if self.curves is None else self.curves.bend(image))
 
     @property
     def falloffs(self) -> LensFalloffs | None:
         """The vignettes by lens, None where they are not fitted."""
         return None if self.vignettes is None else self.vignettes.falloffs
 
-    def step(
-        self, image: int, gradient: ResponseGradient, done: float, *, own: bool = True
-    ) -> None:
-        """Moves the parameters of one image against their gradients; `own` as of `response`.
+    def step(self, image: int, gradient: ResponseGradient, done: float) -> None:
+        """Moves the parameters of one image against their gradients.
 
         The rates fall as `done` goes from 0 to 1.
         """
-        if self.exposure is not None and own:
+        if self.exposure is not None:
             self.exposure.step(image, gradient.log_gain, done)
-        if self.curves is not None and own:
+        if self.curves is not None:
             self.curves.step(image, gradient.bend, done)
         if self.vignettes is not None:
             self.vignettes.step(image, gradient.vignette, done)

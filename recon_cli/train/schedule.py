@@ -73,7 +73,6 @@ class Recipe:
     final_from: float = 1.0  # share from which all other rates fall
     final_rate: float = 1.0  # to which they fall at the end, of their own; exponential
     blur_from: float = 0.6  # share from which blurred views are compared with blurred renders
-    gains_until: float = 0.6  # share up to which early gains are fitted; mid is not before it
     backdrop: float = 0.0  # grey level behind all Gaussians, 0 to 1
 
 
@@ -182,19 +181,6 @@ class Schedule:
         """Tells whether the higher degrees are moved in this step."""
         return self.sh_degree(iteration) > 0 and iteration % self.recipe.sh_every == 0
 
-    def compensates(self, iteration: int) -> bool:
-        """Tells whether images have gains and tone curves of their own in this step."""
-        return self.config.exposure != "early" or iteration <= self._last_gains
-
-    def restores(self, iteration: int) -> bool:
-        """Tells whether Gaussians get the brightness as filmed after this step."""
-        return self.config.exposure == "early" and iteration == self._last_gains
-
-    @property
-    def _last_gains(self) -> int:
-        """The last step with early gains."""
-        return self.first + max(1, round(self.recipe.gains_until * self.steps))
-
     def blurs(self, iteration: int) -> bool:
         """Tells whether blurred views are compared with blurred renders in this step."""
         return self.config.blur == "on" and self.share(iteration - 1) >= self.recipe.blur_from
@@ -251,14 +237,6 @@ class ContinuedSchedule(Schedule):
     def means_rate(self, iteration: int) -> float:
         """Returns the learning rate of the means in units of `Task.means_unit`."""
         return self.recipe.means_restart_rate * super().means_rate(iteration)
-
-    def compensates(self, iteration: int) -> bool:  # noqa: ARG002
-        """Tells whether images have gains and tone curves: early ones ended in the first run."""
-        return self.config.exposure != "early"
-
-    def restores(self, iteration: int) -> bool:  # noqa: ARG002
-        """Returns False: the Gaussians have the brightness as filmed."""
-        return False
 
     def blurs(self, iteration: int) -> bool:  # noqa: ARG002
         """Tells whether blurred views are compared with blurred renders: from the first step."""

@@ -14,7 +14,6 @@ from recon_cli.render.contract import StepOptions
 from recon_cli.render.response import ResponseGradient
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.densification import STRATEGIES
-from recon_cli.train.filmed_brightness import restore_brightness
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.importance import Importance
 from recon_cli.train.motion_blur import BlurredSteps
@@ -68,8 +67,6 @@ class Stepper:
         if result.visible.any():
             self._move(batch, result, iteration)
         self._strategy.control(state, task)
-        if task.schedule.restores(iteration):
-            restore_brightness(state, task)
         return loss
 
     def _gather(self, batch: list[int], iteration: int) -> _BatchResult:
@@ -111,8 +108,7 @@ class Stepper:
             scores=importance is not None and importance.weighs,
             loo=importance is not None and importance.leaves_out,
             harmonics=schedule.moves_sh(iteration), depth_weight=schedule.depth_weight(iteration))
-        response = None if state.photometry is None else state.photometry.response(
-            index, own=schedule.compensates(iteration))
+        response = None if state.photometry is None else state.photometry.response(index)
         compute = self._blurred.choose(view, index, iteration) or self._compute
         result.loss[place], statistics = compute(state.optimizer, view, options, response)
         if statistics is None or not np.isfinite(result.loss[place]):
@@ -132,8 +128,7 @@ class Stepper:
                 continue
             gradient = result.response[place]
             if state.photometry is not None and gradient is not None:
-                state.photometry.step(
-                    index, gradient, schedule.share(iteration), own=schedule.compensates(iteration))
+                state.photometry.step(index, gradient, schedule.share(iteration))
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
             factor=schedule.rate_factor(iteration))
