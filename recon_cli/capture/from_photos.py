@@ -99,7 +99,8 @@ def ingest(
     frames = tuple(sorted((
         Frame(str(of_frame[photo].name), None, photo.name, taken.sharpness.get(photo.name),
               held_out=False, group=index,
-              masked=(out / store.MASKS / str(of_frame[photo].name)).exists())
+              masked=(out / store.MASKS / str(of_frame[photo].name)).exists(),
+              exposure_ev=photo.exposure_ev)
         for index, group in enumerate(groups) for photo in group.photos),
         key=lambda frame: frame.name))
     return IngestedSource(

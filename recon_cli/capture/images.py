@@ -82,6 +82,7 @@ class Photo:
     pictures: int = 1  # of an animation, of which the first one is read
     panorama: bool = False  # its metadata says that no pinhole camera took it
     area: PanoramaArea | None = None  # of the sphere, where it is equirectangular by its metadata
+    exposure_ev: float | None = None  # log2 of exposure time, ISO and aperture, None if unknown
 
     @property
     def name(self) -> str:
@@ -109,7 +110,7 @@ def inspect_photo(path: Path, label: str = "") -> Photo:
             mode, wide, pictures = image.mode, _is_wide(image), _count_pictures(image)
             exif, (width, height) = image.getexif(), _size_in_file(image)
             lens = read_lens(exif, width, height)
-            xmp = read_xmp(image)
+            exposure, xmp = read_exposure(exif), read_xmp(image)
             panorama = is_panorama(xmp, width, height)
             area = panorama_area(xmp, width, height)
             if exif.get(ExifTags.Base.Orientation) in QUARTER_TURNS:
@@ -117,7 +118,7 @@ def inspect_photo(path: Path, label: str = "") -> Photo:
     except BROKEN as error:
         raise unreadable_error(path, error) from error
     return Photo(path, width, height, *lens, label=label, mode=mode, wide=wide,
-                 pictures=pictures, panorama=panorama, area=area)
+                 pictures=pictures, panorama=panorama, area=area, exposure_ev=exposure)
 
 
 def _count_pictures(image: Image.Image) -> int:
@@ -394,6 +395,23 @@ def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
         str(exif.get(tag) or "").strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
     camera = model if model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
     return ExifLens(pixels, camera, focal)
+
+
+def read_exposure(exif: Image.Exif) -> float | None:
+    """Returns log2(t S / (100 N^2)) of exposure time t, ISO S and f-number N; None without t or S.
+
+    A lens that never gives its f-number, as of most phones, is taken to keep it.
+    """
+    detail = exif.get_ifd(ExifTags.IFD.Exif)
+    seconds, f_number = (
+        _positive(detail.get(tag)) for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber))
+    sensitivity = detail.get(ExifTags.Base.ISOSpeedRatings)
+    if isinstance(sensitivity, tuple) and sensitivity:  # EXIF 2.2 allows several
+        sensitivity = sensitivity[0]
+    iso = _positive(sensitivity)
+    if seconds is None or iso is None:
+        return None
+    return math.log2(seconds * iso / 100) - 2 * math.log2(f_number or 1.0)
 
 
 def _sensor_mm(detail: dict[int, Any]) -> float | None:

@@ -221,6 +221,12 @@ class TrainConfig(StageConfig):
     exposure: str = option(
         "auto", "A gain per image; auto: by trial.",
         choices=("auto", "on", "off"))
+    vignette: str = option(
+        "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
+        choices=("auto", "on", "off"), late=True, expert=True)
+    tone: str = option(
+        "auto", "A tone curve per image; auto: by a trial.",
+        choices=("auto", "on", "off"), late=True, expert=True)
     depth: str = option(
         "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
         "budget, unless a trial shows a loss.",
@@ -331,7 +337,8 @@ class RunConfig(SettledConfig):
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
                  "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
                  "sh_rate")
-        return self.densify == "reference" and self.depth != "on" and all(
+        return self.densify == "reference" and (
+            "on" not in (self.depth, self.vignette, self.tone)) and all(
             getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 

@@ -21,6 +21,8 @@ PSNR_CONVENTION = "mean of per-image dB, float render clamped to [0, 1] against 
 GAIN_CONVENTION = (
     "the same after the factor of each view and channel that fits its truth best, as the exposure "
     "of a view that was not trained on is not known")
+VIGNETTE_CONVENTION = (
+    "Renders have the vignette of their lens, as training found it; the scene and its files do not")
 PSNR_8BIT_CONVENTION = "the same of the render rounded to 8 bits, as a picture file holds it"
 SSIM_CONVENTION = (
     "scikit-image: 11x11 Gaussian window, sigma 1.5, 5 px border cropped, mean of channels")

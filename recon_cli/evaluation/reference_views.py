@@ -22,6 +22,7 @@ from recon_cli.evaluation.scores import MeanScore, ViewScore
 from recon_cli.io.images import fit_camera, to_uint8
 from recon_cli.io.views import MASK_HINT, ReferenceView, load_views
 from recon_cli.render import RenderOutput, render
+from recon_cli.render.response import LensFalloffs
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
@@ -99,12 +100,14 @@ def score_image(
 def score_views(
     splats: Splats, views: Sequence[ReferenceView], sh_degree: int, backend: str,
     *, perceptual: Perceptual | None = None, threads: int = 1,
+    falloffs: LensFalloffs | None = None,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _image: None,
 ) -> RenderScores:
     """Renders every view, at least one, of a model and returns its scores.
 
     The faces of a panorama are scored together, under the name of their frame. `perceptual` is
-    LPIPS; `on_view` gets each view and its render [H, W, 3], not clamped, in one of `threads`.
+    LPIPS; `falloffs` shade the renders; `on_view` gets each view and its render [H, W, 3], not
+    clamped, in one of `threads`.
     """
     weights = face_weights(views)
 
@@ -122,7 +125,8 @@ def score_views(
 
     milliseconds: list[float] = []
     found = _measure(
-        splats, views, sh_degree, backend, score, threads=threads, milliseconds=milliseconds)
+        splats, views, sh_degree, backend, score, threads=threads, milliseconds=milliseconds,
+        falloffs=falloffs)
     rows = [row for row in found if not isinstance(row, FaceScore)]
     rows += join_faces([row for row in found if isinstance(row, FaceScore)])
     scores = tuple(replace(score, gain_psnr_db=corrected) for score, corrected in rows)
@@ -131,7 +135,8 @@ def score_views(
 
 def mean_psnr(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str,
-    *, corrected: bool = False, threads: int = 1, on_view: Callable[[], None] = lambda: None,
+    *, corrected: bool = False, threads: int = 1, falloffs: LensFalloffs | None = None,
+    on_view: Callable[[], None] = lambda: None,
 ) -> float:
     """Returns the mean PSNR in dB over views, at least one; `on_view` is called in `threads`."""
     metric = corrected_psnr if corrected else psnr
@@ -141,7 +146,8 @@ def mean_psnr(
         on_view()
         return value
 
-    return statistics.fmean(_measure(splats, views, sh_degree, backend, score, threads=threads))
+    return statistics.fmean(_measure(
+        splats, views, sh_degree, backend, score, threads=threads, falloffs=falloffs))
 
 
 def mean_score(
@@ -156,7 +162,7 @@ def mean_score(
 def _measure(
     splats: Splats, views: Sequence[_View], sh_degree: int, backend: str,
     score: Callable[[_View, NDArray[np.float32]], _Item], *, threads: int = 1,
-    milliseconds: list[float] | None = None,
+    milliseconds: list[float] | None = None, falloffs: LensFalloffs | None = None,
 ) -> list[_Item]:
     """Returns the `score` of each view and its render [H, W, 3].
 
@@ -170,7 +176,8 @@ def _measure(
             for view in group:
                 start = time.perf_counter()
                 output = render_view(splats, view.camera, sh_degree, backend)
-                images.append(np.asarray(output.rgb.cpu().numpy(), np.float32))  # waits for it
+                image = np.asarray(output.rgb.cpu().numpy(), np.float32)  # waits for it
+                images.append(image if falloffs is None else falloffs.shade(image, view.camera))
                 if milliseconds is not None:
                     milliseconds.append(1e3 * (time.perf_counter() - start))
             results += pool.map(score, group, images)
@@ -178,7 +185,8 @@ def _measure(
 
 
 def mean_psnr_on_device(
-    splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str
+    splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str,
+    falloffs: LensFalloffs | None = None,
 ) -> float:
     """Returns the mean PSNR in dB over views, at least one, in float32 on the model's device."""
     device = splats.means.device
@@ -186,6 +194,8 @@ def mean_psnr_on_device(
     with torch.no_grad():
         for view in views:
             rgb = render_view(splats, view.camera, sh_degree, backend).rgb
+            if falloffs is not None:
+                rgb = falloffs.shade_tensor(rgb, view.camera)
             errors = (rgb.clamp(0, 1) - view.pixels(device)).square()
             counting = view.counting(device)
             error = (errors if counting is None else errors[counting]).mean().item()

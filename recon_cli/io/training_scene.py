@@ -35,9 +35,11 @@ def load_scene(
     world = WorldSummary.read(sfm)
     up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
     ingest = folders["ingest"]
-    moments = {
-        frame.name: Moment(frame.source, frame.time_seconds)
-        for frame in read_frame_list(ingest).frames if frame.time_seconds is not None}
+    frames = read_frame_list(ingest).frames
+    moments = {frame.name: Moment(frame.source, frame.time_seconds)
+               for frame in frames if frame.time_seconds is not None}
+    exposures = {frame.name: frame.exposure_ev
+                 for frame in frames if frame.exposure_ev is not None}
     return dataclasses.replace(
-        scene, up=up, moments=moments,
+        scene, up=up, moments=moments, exposures=exposures,
         depth=ingest if (ingest / depth_maps.LIST).exists() else None)

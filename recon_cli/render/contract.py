@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon_cli.render.response import Response
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
@@ -120,7 +121,7 @@ class TargetImage:
 
     pixels: NDArray[np.uint8]  # [H, W, 3]
     mask: NDArray[np.bool_] | None = None  # [H, W] True where a pixel counts; None: everywhere
-    gain: NDArray[np.float32] | None = None  # [3] factors of the rendered channels; None for ones
+    response: Response | None = None  # of the camera; None: the photograph is the render
     depth: TargetDepth | None = None  # None where depth is not part of the loss
 
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from recon_cli import machine
 from recon_cli.errors import BackendError
 from recon_cli.render.contract import Renderer, StepOptions, TargetImage
+from recon_cli.render.response import Response, ResponseTensors
 from recon_cli.render.torch.tiles import render as torch_render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -216,7 +217,8 @@ def _compare_steps(
     """
     rng, shape = np.random.default_rng(2), (camera.height, camera.width)
     pixels = rng.integers(0, 256, (*shape, 3), np.uint8)
-    masked = TargetImage(pixels, rng.random(shape) < 0.7, np.array([0.8, 1.1, 1.3], np.float32))
+    masked = TargetImage(pixels, rng.random(shape) < 0.7, Response(
+        np.array([0.8, 1.1, 1.3], np.float32), vignette=(-0.2, -0.1), bend=0.1))
     scores = StepOptions(_DEGREE, _SSIM_WEIGHT, details=True, scores=True, loo=True)
     for label, target, options in (
         ("step", TargetImage(pixels), StepOptions(_DEGREE, _SSIM_WEIGHT)),
@@ -264,8 +266,8 @@ def _reference_step(
     device = splats.means.device
     rgb = torch_render(leaves, camera, leaves.means.new_zeros(3), degree, False).rgb
     truth = torch.from_numpy(target.pixels).to(device).double() / 255
-    if target.gain is not None:
-        rgb = rgb * torch.from_numpy(target.gain).to(device).double()
+    if target.response is not None:
+        rgb = ResponseTensors(target.response, camera, rgb).apply(rgb)
     if target.mask is not None:
         rgb = torch.where(torch.from_numpy(target.mask).to(device)[..., None], rgb, truth)
     shift = torch.arange(-5, 6, device=device, dtype=torch.float64)

@@ -52,6 +52,8 @@ class Scene:
     cell: Cell | None = None  # the part that is modelled, of a block of a larger scene; None: all
     # when the frames of videos were taken, by name; those of photos are not known
     moments: Mapping[str, Moment] = field(default_factory=dict)
+    # log2 of the exposures of photos by EXIF, by name of the frame, where it is known
+    exposures: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def extent(self) -> float:

@@ -27,6 +27,7 @@ from recon_cli.evaluation.metrics import (
     FACES_CONVENTION,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
+    VIGNETTE_CONVENTION,
     Perceptual,
     load_lpips,
     psnr,
@@ -57,6 +58,7 @@ from recon_cli.splats.ply import read_ply
 from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_masks import read_summary, with_masks
 from recon_cli.train.moving_search import FINER, Judge, find_in_held_out
+from recon_cli.train.photometry import read_falloffs
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.assess import TrustTask, assess
@@ -100,7 +102,7 @@ class _Evaluation:
         path, backend = self.folders[model] / "splats.ply", self.ctx.backend
         threads = self.ctx.threads
         splats = read_ply(path).map(lambda tensor: tensor.to(self.ctx.device))
-        degree = self.config.sh_degree
+        degree, falloffs = self.config.sh_degree, read_falloffs(self.folders[model])
 
         pictures = PanoramaPictures(self.held_out)
 
@@ -115,10 +117,10 @@ class _Evaluation:
 
         scores = score_views(
             splats, self.held_out, degree, backend, perceptual=perceptual, threads=threads,
-            on_view=save)
+            falloffs=falloffs, on_view=save)
         seen_db = {
             name: mean_psnr(splats, views, degree, backend, corrected=self.gains, threads=threads,
-                            on_view=on_view)
+                            falloffs=falloffs, on_view=on_view)
             for name, views in self.training_views.items()}
         log = self.folders[model] / LOG
         seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
@@ -168,6 +170,8 @@ class _Evaluation:
             note += f"Masks on {masked} of {len(self.held_out)} views: {MASK_CONVENTION}\n"
         if self.protocol:
             note += f"Protocol {self.protocol}: {PROTOCOLS[self.protocol].words}; {SPLIT_WORDS}\n"
+        if any(read_falloffs(folder) for folder in self.folders.values()):
+            note += f"{VIGNETTE_CONVENTION}\n"
         if faces:
             note += f"{faces} of these views are {FACES_CONVENTION}\n"
         return note + "".join(

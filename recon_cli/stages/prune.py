@@ -14,6 +14,7 @@ from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import max_gaussians, write_ply
 from recon_cli.train.fit import validation_psnr
+from recon_cli.train.photometry import write_photometry
 from recon_cli.train.prune_loop import RATIO, prune_loop, remaining
 from recon_cli.train.prune_run import StoredPruneRun, load_prune_source, prune_while_good
 from recon_cli.train.runner import LOG, seconds_at
@@ -43,6 +44,7 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     run.write_rounds()
     state = run.state
     write_ply(out / "splats.ply", state.splats)
+    write_photometry(out, state.photometry)
     run.clear()
     left = len(state.splats)
     return PruneSummary(

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
+from recon_cli.render.response import LensFalloffs
 from recon_cli.scene.motion import Motion
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
@@ -42,8 +43,10 @@ from recon_cli.train.moving_search import (
     share_of,
     shows_movement,
 )
+from recon_cli.train.photometric_evidence import PhotometricEvidence, find_photometry
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.shutter import BlurEvidence, ViewMotions
+from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 from recon_cli.workspace.summaries import TrialDecision
 
@@ -135,7 +138,7 @@ _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
-PARTS = ("far", "stereo", "exposure", "images", "depth", "blur")
+PARTS = ("far", "stereo", "exposure", "vignette", "tone", "images", "depth", "blur")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
@@ -173,6 +176,10 @@ class TrialScene:
 def examine(scene: TrialScene) -> Needs:
     """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     config = scene.task.schedule.config
+    if config.densify == "reference":  # sees what tables of the literature saw
+        for part in ("vignette", "tone"):
+            if getattr(config, part) == "auto":
+                config = _with(config, part, "off")
     if config.stereo == "auto":
         config = replace(config, stereo="on")
     bench = _Bench(scene)
@@ -203,6 +210,11 @@ def examine(scene: TrialScene) -> Needs:
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
+    light = bench.light(config)
+    settle("vignette", "on" if light.shades else None,
+           f"the corners of the views lack {100 * light.corner_loss:.1f}% of the light only")
+    settle("tone", "on" if light.bends_differ else None,
+           f"tone curves of the views differ by {100 * light.bend_spread:.1f}% only")
     if config.depth == "auto" and not (scene.task.has_depth or scene.task.depth_refused):
         config = replace(config, depth="off")
     settle("depth", "on" if scene.task.has_depth else None, scene.task.depth_refused)
@@ -240,13 +252,20 @@ class _Bench:
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
                     else FarContent.nothing())
         drifting = task.schedule.config.exposure != "off"
-        self.drift = (estimate_gains(task.train, scene.points) if drifting
+        self.drift = (estimate_gains(task.train, scene.points, exposures=task.exposures) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))
         self.blur = (task.motions.find_blur(task.train)
                      if task.motions is not None and task.schedule.config.blur != "off"
                      else BlurEvidence.nothing())
         self._scores: dict[tuple[object, ...], list[float]] = {}
-        self._models: dict[tuple[object, ...], Splats] = {}
+        self._states: dict[tuple[object, ...], TrainState] = {}
+
+    def light(self, config: RunConfig) -> PhotometricEvidence:
+        """Returns what the points show of vignettes and tone curves, where options ask for it."""
+        task = self._scene.task
+        if "auto" not in (config.vignette, config.tone):
+            return PhotometricEvidence.nothing(task.train)
+        return find_photometry(task.train, self._scene.points)
 
     def shutter(self, config: RunConfig) -> float | None:
         """Returns the shutter time in seconds that explains views best; None without evidence.
@@ -276,7 +295,10 @@ class _Bench:
             return skip_trial(part, "too few of the views to score see any of it")
 
         def scores(config: RunConfig) -> list[float]:
-            values = self._run(config, self._blur_level if part == "blur" else LEVEL)
+            level = self._blur_level if part == "blur" else LEVEL
+            values = self._run(config, level)
+            if part in ("vignette", "tone"):  # brightness as filmed counts as much as all else
+                values = np.mean([values, self._run(config, level, as_is=True)], axis=0).tolist()
             return [values[i] for i in telling]
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
@@ -312,7 +334,7 @@ class _Bench:
             return None
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
         self._run(config)
-        model = self._models[_key(config)]
+        model = self._states[_key(config)].splats
         if config.moving == "auto" and not shows_movement(model, views, judge):
             decisions.append(replace(skip_trial("moving", "no views contradict the others"),
                                      seconds=time.perf_counter() - start))
@@ -352,14 +374,16 @@ class _Bench:
             return self._score(splats, held_out, config)
 
         return decide("moving", (
-            lambda: score(model), lambda: score(self._fit(config, [masked[row] for row in rows]))),
+            lambda: score(model),
+            lambda: score(self._fit(config, [masked[row] for row in rows]).splats)),
             unless_worse=True)
 
     def _probe(self, config: RunConfig, views: Sequence[TrainView], side: int) -> Splats:
         """Returns a model of views reduced to `side` pixels, and of as many more Gaussians."""
         finer = side / SIDE
         largest = max(max(view.camera.width, view.camera.height) for view in views)
-        return self._fit(self._short(config, finer), views, factor=max(1.0, largest / side))
+        return self._fit(
+            self._short(config, finer), views, factor=max(1.0, largest / side)).splats
 
     def _telling(self, part: str) -> list[int]:
         """Returns which held-out views can tell whether a part pays; the others only add noise."""
@@ -376,12 +400,20 @@ class _Bench:
         held_out = task.train if chosen.own else task.validation
         return chosen.train, [held_out[i] for i in chosen.held_out]
 
-    def _run(self, config: RunConfig, level: int = LEVEL) -> list[float]:
-        """Returns the corrected PSNR in dB of each held-out view after a short run."""
-        key = _key(config, level)
-        if key not in self._scores:
-            self._models[key], self._scores[key] = self._train(self._short(config), level)
-        return self._scores[key]
+    def _run(
+        self, config: RunConfig, level: int = LEVEL, *, as_is: bool = False
+    ) -> list[float]:
+        """Returns the PSNR in dB of each held-out view after a short run, corrected or as it is.
+        """
+        key, short = _key(config, level), self._short(config)
+        if key not in self._states:
+            self._states[key] = self._train(short, level)
+        if (scored := (as_is, *key)) not in self._scores:
+            state = self._states[key]
+            self._scores[scored] = self._score(
+                state.splats, self._views()[1], short, level, self._held_out_motions(short),
+                None if state.photometry is None else state.photometry.falloffs, as_is=as_is)
+        return self._scores[scored]
 
     def _short(self, config: RunConfig, finer: float = 1.0) -> RunConfig:
         """Returns the options of a short run, of more steps and Gaussians by a factor."""
@@ -390,33 +422,37 @@ class _Bench:
             max_gaussians=min(config.max_gaussians, round(finer * _CAP)), early_stop=False,
             batch_views=1)
 
-    def _train(self, config: RunConfig, level: int) -> tuple[Splats, list[float]]:
+    def _train(self, config: RunConfig, level: int) -> TrainState:
         scene, train = self._scene, self._scene.task.train
         if scene.twins is not None and config.images == "denoised":
             train = [replace(twin, depth=view.depth)
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
-        rows, held_out = self._views()  # scored against the task's own, whatever was trained on
+        rows, _ = self._views()
         motions = scene.task.motions and scene.task.motions.select(rows)
-        splats = self._fit(config, [train[i] for i in rows], factor=level, motions=motions)
-        return splats, self._score(splats, held_out, config, level, self._held_out_motions(config))
+        exposures = None if scene.task.exposures is None else scene.task.exposures[list(rows)]
+        return self._fit(config, [train[i] for i in rows], factor=level, motions=motions,
+                         exposures=exposures)
 
     def _score(
         self, splats: Splats, views: Sequence[TrainView], config: RunConfig, level: int = LEVEL,
-        motions: Sequence[Motion | None] = (),
+        motions: Sequence[Motion | None] = (), falloffs: LensFalloffs | None = None,
+        *, as_is: bool = False,
     ) -> list[float]:
         """Returns the corrected PSNR in dB of each view, blurred by its motion where it has one."""
         task, degree = self._scene.task, config.sh_degree
         small = [reduce_view(view, level) for view in views]
         return [
-            mean_psnr(splats, [view], degree, task.backend, corrected=True) if motion is None
+            mean_psnr(
+                splats, [view], degree, task.backend, corrected=not as_is, falloffs=falloffs)
+            if motion is None
             else blurred_psnr(splats, view, motion, replace(task, schedule=Schedule(config)))
             for view, motion in zip(small, motions or [None] * len(small), strict=True)]
 
     def _fit(
         self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL,
-        motions: ViewMotions | None = None,
-    ) -> Splats:
-        """Returns the Gaussians of a short run on views reduced by a factor."""
+        motions: ViewMotions | None = None, exposures: NDArray[np.float64] | None = None,
+    ) -> TrainState:
+        """Returns the end of a short run on views reduced by a factor."""
         scene, task = self._scene, self._scene.task
         # Far content seemed worth up to 1 dB less where a run so short replaced Gaussians, too; in
         # runs of full length it is worth as much as without (tests/bench/notes/training.md).
@@ -426,11 +462,11 @@ class _Bench:
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(view, factor) for view in views], [], schedule, task.extent,
                      task.backend, task.device, nearness=task.nearness, stereo=task.stereo,
-                     motions=motions)
+                     motions=motions, exposures=exposures)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, config.iterations)
-        return state.splats
+        return state
 
     def _held_out_motions(self, config: RunConfig) -> Sequence[Motion | None]:
         """Returns the motions of the views to score; None for those that are scored as sharp."""

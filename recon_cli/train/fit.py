@@ -71,4 +71,5 @@ def validation_psnr(state: TrainState, task: Task) -> float | None:
     if not task.validation:
         return None
     degree = task.schedule.sh_degree(max(1, state.iteration))
-    return mean_psnr_on_device(state.splats, task.validation, degree, task.backend)
+    falloffs = None if state.photometry is None else state.photometry.falloffs
+    return mean_psnr_on_device(state.splats, task.validation, degree, task.backend, falloffs)

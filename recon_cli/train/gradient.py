@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render import Statistics, render
 from recon_cli.render.contract import StepOptions, TargetDepth, TargetImage
 from recon_cli.render.depth_loss import depth_loss
+from recon_cli.render.response import Response, ResponseGradient, ResponseTensors
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.optimizer import SplatOptimizer
 
@@ -40,16 +40,16 @@ class GradientStep(Protocol):
     """
 
     @property
-    def log_gain_gradient(self) -> NDArray[np.float64]:
-        """Gradient [3] of the logarithm of the gain, of the last view that was given one."""
+    def response_gradient(self) -> ResponseGradient:
+        """Gradients of the response of the last view that was given one."""
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
-        gain: NDArray[np.float32] | None = None,
+        response: Response | None = None,
     ) -> tuple[float, Statistics | None]:
         """Returns loss and statistics of a view, None where it sees no Gaussian.
 
-        Statistics are valid until the next call. Rendered channels are multiplied by `gain` [3].
+        Statistics are valid until the next call. The photograph is the render's after `response`.
         """
 
 
@@ -89,16 +89,16 @@ class _FusedStep:
         self._compute = PhotometricStep()
 
     @property
-    def log_gain_gradient(self) -> NDArray[np.float64]:
-        return self._compute.log_gain_gradient
+    def response_gradient(self) -> ResponseGradient:
+        return self._compute.response_gradient
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
-        gain: NDArray[np.float32] | None = None,
+        response: Response | None = None,
     ) -> tuple[float, Statistics | None]:
         loss = self._compute(
             optimizer.splats, optimizer.gradients, view.camera,
-            _target(view, gain, options), options)
+            _target(view, response, options), options)
         return loss, self._compute.statistics if self._compute.instances else None
 
 
@@ -109,7 +109,7 @@ class _DeviceStep:
         from recon_cli.render.triton.step import PhotometricStep
 
         self._compute = PhotometricStep(device)
-        self.log_gain_gradient = np.zeros(3)
+        self.response_gradient = ResponseGradient.zeros()
 
     @property
     def counted(self) -> Tensor:
@@ -121,11 +121,11 @@ class _DeviceStep:
 
     def start(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
-        gain: NDArray[np.float32] | None = None,
+        response: Response | None = None,
     ) -> Statistics:
         self._compute(
             optimizer.splats.map(lambda tensor: tensor.detach()), optimizer.gradients, view.camera,
-            _target(view, gain, options), options)
+            _target(view, response, options), options)
         return self._compute.statistics
 
     def close(self) -> StepReport:
@@ -133,15 +133,15 @@ class _DeviceStep:
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
-        gain: NDArray[np.float32] | None = None,
+        response: Response | None = None,
     ) -> tuple[float, Statistics | None]:
         while True:
-            statistics = self.start(optimizer, view, options, gain)
+            statistics = self.start(optimizer, view, options, response)
             report = self.close()
             if report.stopped is None:  # else there is room for it now
                 break
-        if gain is not None:
-            self.log_gain_gradient = self._compute.log_gain_gradient.cpu().numpy()
+        if response is not None and self._compute.response_tensors is not None:
+            self.response_gradient = self._compute.response_tensors.gradient()
         return report.loss, statistics if report.instances else None
 
 
@@ -150,11 +150,11 @@ class _AutogradStep:
 
     def __init__(self, backend: str) -> None:
         self._backend = backend
-        self.log_gain_gradient = np.zeros(3)
+        self.response_gradient = ResponseGradient.zeros()
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
-        gain: NDArray[np.float32] | None = None,
+        response: Response | None = None,
     ) -> tuple[float, Statistics | None]:
         splats = optimizer.splats
         device, counting = splats.means.device, view.counting(splats.means.device)
@@ -163,10 +163,9 @@ class _AutogradStep:
             backend=self._backend, scores=options.details or options.scores or options.loo,
             mask=counting)
         rgb = output.rgb
-        log_gain = None
-        if gain is not None:
-            log_gain = torch.from_numpy(gain).to(device, rgb.dtype).log().requires_grad_()
-            rgb = rgb * log_gain.exp()
+        tensors = None if response is None else ResponseTensors(response, view.camera, rgb)
+        if tensors is not None:
+            rgb = tensors.apply(rgb)
         loss = photometric_loss(rgb, view.pixels(device), options.ssim_weight, mask=counting)
         target = _target_depth(view, options)
         if target is not None:
@@ -178,15 +177,15 @@ class _AutogradStep:
             return value, None
         if np.isfinite(value):
             loss.backward()  # type: ignore[no-untyped-call]
-            if log_gain is not None and log_gain.grad is not None:
-                self.log_gain_gradient = log_gain.grad.cpu().double().numpy()
+            if tensors is not None:
+                self.response_gradient = tensors.gradient()
         return value, output.statistics
 
 
 def _target(
-    view: TrainView, gain: NDArray[np.float32] | None, options: StepOptions
+    view: TrainView, response: Response | None, options: StepOptions
 ) -> TargetImage:
-    return TargetImage(view.image, view.mask, gain, _target_depth(view, options))
+    return TargetImage(view.image, view.mask, response, _target_depth(view, options))
 
 
 def _target_depth(view: TrainView, options: StepOptions) -> TargetDepth | None:

@@ -16,6 +16,8 @@ from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
+from recon_cli.train.photometric_evidence import find_photometry
+from recon_cli.train.photometry import Curves, Photometry, Vignettes
 from recon_cli.train.schedule import REFERENCE
 from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.stereo_points import SurfacePoints
@@ -80,7 +82,7 @@ def first_state(
         far = None
     elif far is None:
         far = far_content(task.train, points, task.extent)
-    gains = estimate_gains(task.train, points).log_gains if config.exposure == "on" else None
+    photometry = new_photometry(task, points)
     sparse = len(points)
     surfaces = surfaces_of(task, sparse)
     points = np.concatenate([points, surfaces.points])
@@ -98,7 +100,7 @@ def first_state(
         backdrop=Backdrop.behind(grey, centers) if grey else None)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
-        backend=task.backend, exposure=new_exposure(task, gains))
+        backend=task.backend, photometry=photometry)
 
 
 def surfaces_of(task: Task, sparse: int) -> SurfacePoints:
@@ -122,14 +124,14 @@ def restore_state(path: Path, task: Task) -> TrainState:
     """
     return load_state(
         path, task.schedule.config, task.means_unit, task.device, backend=task.backend,
-        exposure=new_exposure(task))
+        photometry=new_photometry(task))
 
 
 def begin_state(splats: Splats, task: Task) -> TrainState:
     """Returns the state before the first step of a run that begins with these Gaussians."""
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.means_unit,
-        backend=task.backend, exposure=new_exposure(task))
+        backend=task.backend, photometry=new_photometry(task))
 
 
 def make_finished_state(splats: Splats, task: Task) -> TrainState:
@@ -142,12 +144,25 @@ def make_finished_state(splats: Splats, task: Task) -> TrainState:
     return state
 
 
-def new_exposure(
-    task: Task, log_gains: NDArray[np.float64] | None = None
-) -> Exposure | None:
-    """Returns the gains of the training images before any step; None unless they are fitted."""
-    on = task.schedule.config.exposure == "on"
-    return Exposure(len(task.train), start=log_gains) if on else None
+def new_photometry(
+    task: Task, points: NDArray[np.float64] | None = None
+) -> Photometry | None:
+    """Returns the photometry of the training images before any step; None unless any is fitted.
+
+    It starts with what `points` [P, 3] show; without them with no gain, curve or vignette.
+    """
+    config, views = task.schedule.config, task.train
+    gains = bends = exponents = None
+    if points is not None and config.exposure == "on":
+        gains = estimate_gains(views, points, exposures=task.exposures).log_gains
+    if points is not None and "on" in (config.tone, config.vignette):
+        evidence = find_photometry(views, points)
+        bends, exponents = evidence.bends, evidence.vignettes
+    return Photometry.from_parts(
+        Exposure(len(views), start=gains) if config.exposure == "on" else None,
+        Curves(len(views), start=bends) if config.tone == "on" else None,
+        Vignettes([view.camera for view in views], start=exponents)
+        if config.vignette == "on" else None)
 
 
 def first_splats(

@@ -12,6 +12,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,12 +31,18 @@ from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.train.blocks import MERGE_SHARE, BlockJob, record
 from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.initialize import begin_state, restore_state
+from recon_cli.train.photometry import write_photometry
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.schedule import make_schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.train_data import gaussians_that_fit, load_task, read_config, write_config
 from recon_cli.workspace.atomic import delete
-from recon_cli.workspace.summaries import LogRow, MergeSummary, TrainSummary
+from recon_cli.workspace.summaries import (
+    LogRow,
+    MergeSummary,
+    PhotometrySummary,
+    TrainSummary,
+)
 
 _FINETUNE = 0.25  # steps after the merge, of those of all blocks
 # Factor of all learning rates in these steps but the means', which restarts lower by itself. Those
@@ -98,6 +105,7 @@ def merge_blocks(
                        "merge")
     config = dataclasses.replace(config, iterations=before + (0 if state is None else state.steps))
     write_ply(out / "splats.ply", splats)
+    write_photometry(out, None if state is None else state.photometry)
     write_config(out, config)
     delete(out / CHECKPOINT)
     values = list(changes.values())
@@ -107,12 +115,13 @@ def merge_blocks(
         seam_change_db=round(float(np.mean(values)), 3) if values else None,
         worst_seam_db=round(min(values), 3) if values else None)
     last = None if state is None else LogRow.read_all(out / LOG)[-1]
-    return _summarize(config, [block.summary for block in blocks], merge, len(splats), scene, last)
+    return _summarize(
+        config, [block.summary for block in blocks], merge, len(splats), scene, last, out)
 
 
 def _summarize(
     config: RunConfig, blocks: Sequence[TrainSummary], merge: MergeSummary, gaussians: int,
-    scene: Scene, last: LogRow | None,
+    scene: Scene, last: LogRow | None, out: Path,
 ) -> TrainSummary:
     """Returns the summary of the whole; `last` is the end of the log of the fine-tuning, if any."""
     cameras = [fit_camera(view.camera, config.max_size) for view in scene.train]
@@ -129,7 +138,7 @@ def _summarize(
         estimated_seconds=sum(block.estimated_seconds for block in blocks),
         calibration_seconds=sum(block.calibration_seconds for block in blocks),
         cuda_peak_bytes=max(block.cuda_peak_bytes for block in blocks), blocks=len(blocks),
-        merge=merge)
+        merge=merge, photometry=PhotometrySummary.read(out))
 
 
 def _run_config(
@@ -138,12 +147,14 @@ def _run_config(
     """Returns the options of the fine-tuning: those of the blocks."""
     configs = [block.config for block in blocks]
     denoised = all(each.images == "denoised" for each in configs)
-    drifting = steps > 0 and any(each.exposure == "on" for each in configs)
+    fitted: dict[str, Any] = {
+        part: "on" if steps > 0 and any(getattr(each, part) == "on" for each in configs)
+              else "off" for part in ("exposure", "vignette", "tone")}
     return dataclasses.replace(
         configs[0], iterations=max(1, steps), max_size=max(each.max_size for each in configs),
         sh_degree=degree, max_gaussians=max(MIN_GAUSSIANS, count), far="off", stereo="off",
         images="denoised" if denoised else "original",
-        exposure="on" if drifting else "off", early_stop=False)
+        early_stop=False, **fitted)
 
 
 def _finetune(

@@ -15,13 +15,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.errors import ConfigError
 from recon_cli.evaluation.metrics import corrected_psnr
 from recon_cli.render import Statistics, render
 from recon_cli.render.contract import StepOptions
+from recon_cli.render.response import Response, ResponseGradient, ResponseTensors
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.motion import Motion
 from recon_cli.scene.splats import Splats
@@ -143,24 +143,23 @@ class _BlurredStep:
     def __init__(self, backend: str, plain: GradientStep) -> None:
         self._backend, self._plain = backend, plain
         self.cameras: list[Camera] = []  # of the next view
-        self.log_gain_gradient: NDArray[np.float64] = np.zeros(3)
+        self.response_gradient = ResponseGradient.zeros()
 
     def __call__(
         self, optimizer: SplatOptimizer, view: TrainView, options: StepOptions,
-        gain: NDArray[np.float32] | None = None,
+        response: Response | None = None,
     ) -> tuple[float, Statistics | None]:
         # scores are of single renders
-        scored = self._plain(optimizer, view, options, gain)[1] if (
+        scored = self._plain(optimizer, view, options, response)[1] if (
             options.scores or options.loo) else None
         optimizer.discard()
         splats, device = optimizer.splats, optimizer.splats.means.device
         outputs = [render(splats, camera, splats.background, options.sh_degree,
                           backend=self._backend) for camera in self.cameras]
         image = mean_light([output.rgb for output in outputs])
-        log_gain = None
-        if gain is not None:
-            log_gain = torch.from_numpy(gain).to(device, image.dtype).log().requires_grad_()
-            image = image * log_gain.exp()
+        tensors = None if response is None else ResponseTensors(response, view.camera, image)
+        if tensors is not None:
+            image = tensors.apply(image)
         loss = photometric_loss(
             image, view.pixels(device), options.ssim_weight, mask=view.counting(device))
         value = float(loss.detach())
@@ -170,8 +169,8 @@ class _BlurredStep:
         if np.isfinite(value):
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.take_gradients()
-            if log_gain is not None and log_gain.grad is not None:
-                self.log_gain_gradient = log_gain.grad.cpu().double().numpy()
+            if tensors is not None:
+                self.response_gradient = tensors.gradient()
         return value, scored or _join([output.statistics for output in outputs])
 
 

@@ -14,13 +14,14 @@ from recon_cli.splats.ply import write_ply
 from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.moving_masks import EditedMasks, read_summary
+from recon_cli.train.photometry import write_photometry
 from recon_cli.train.plan import first_or_saved, plan_task
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import delete
 from recon_cli.workspace.records import ImportRecord
-from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
+from recon_cli.workspace.summaries import LogRow, PhotometrySummary, TrainPlan, TrainSummary
 
 
 def fit_scene(
@@ -42,6 +43,7 @@ def fit_scene(
         keep={task.schedule.mid: "mid.safetensors"}), ctx)
     save_state(out / "final.safetensors", state)
     write_ply(out / "splats.ply", state.splats)
+    write_photometry(out, state.photometry)
     delete(out / CHECKPOINT)
     return _summarize(state, task, out, ctx)
 
@@ -62,4 +64,4 @@ def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> T
         parts=model_parts(config), skipped_steps=state.skipped, estimated_seconds=plan.seconds,
         calibration_seconds=round(plan.cost["seconds"], 3),
         cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,
-        moving=read_summary(out))
+        moving=read_summary(out), photometry=PhotometrySummary.read(out))

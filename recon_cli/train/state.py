@@ -16,8 +16,8 @@ from recon_cli.errors import FormatError, TrainingError
 from recon_cli.render import Statistics
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import Splats
-from recon_cli.train.exposure import Exposure
 from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.photometry import Photometry
 from recon_cli.workspace.atomic import parse_json, replacing
 
 LONG_SAVE = 0.25  # seconds; a checkpoint that takes longer is written less often
@@ -89,7 +89,7 @@ class TrainState:
     # (iteration, validation PSNR in dB) at each regular report so far
     looks: list[tuple[int, float]] = field(default_factory=list)
     jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it continued
-    exposure: Exposure | None = None  # gains of the training images; None where that part is off
+    photometry: Photometry | None = None  # of the training images; None where no part is fitted
 
     @property
     def steps(self) -> int:
@@ -104,14 +104,14 @@ class TrainState:
 
 def new_state(
     splats: Splats, config: RunConfig, means_unit: float, *, backend: str = "torch",
-    exposure: Exposure | None = None,
+    photometry: Photometry | None = None,
 ) -> TrainState:
     """Returns the state before the first step."""
     generator = torch.Generator().manual_seed(config.seed)
     gathered = DensificationStats.zeros(len(splats), splats.means.device)
     return TrainState(
         SplatOptimizer(splats, config, means_unit, backend=backend), gathered, generator,
-        first_count=len(splats), exposure=exposure)
+        first_count=len(splats), photometry=photometry)
 
 
 def save_state(path: Path, state: TrainState) -> None:
@@ -137,14 +137,14 @@ def tensors_of(state: TrainState) -> dict[str, Tensor]:
     for name, value in vars(state.gathered).items():
         tensors[f"gathered.{name}"] = value
     tensors["generator"] = state.generator.get_state()
-    return tensors if state.exposure is None else tensors | state.exposure.tensors()
+    return tensors if state.photometry is None else tensors | state.photometry.tensors()
 
 
 def load_state(
     path: Path, config: RunConfig, means_unit: float, device: torch.device, *,
-    backend: str = "torch", exposure: Exposure | None = None,
+    backend: str = "torch", photometry: Photometry | None = None,
 ) -> TrainState:
-    """Returns the state that `save_state` wrote; `exposure` takes its part back.
+    """Returns the state that `save_state` wrote; `photometry` takes its part back.
 
     Raises:
         FormatError: the file is truncated or of another version.
@@ -172,9 +172,9 @@ def load_state(
             int(scalars["skipped"]), [(int(at), float(psnr)) for at, psnr in scalars["looks"]],
             (int(scalars["jump"][0]), int(scalars["jump"][1])) if scalars["jump"] else None)
         state.optimizer.restore(tensors)
-        if exposure is not None:
-            exposure.restore(tensors)
-        state.exposure = exposure
+        if photometry is not None:
+            photometry.restore(tensors)
+        state.photometry = photometry
     except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise _unreadable(path, error) from error
     check_finite(tensors, f"The checkpoint {path} is damaged")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import TrainingError
 from recon_cli.render import Statistics
 from recon_cli.render.contract import StepOptions
+from recon_cli.render.response import ResponseGradient
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.densification import STRATEGIES
 from recon_cli.train.gradient import gradient_step
@@ -29,12 +30,12 @@ class _BatchResult:
 
     loss: NDArray[np.float64]  # [B]
     visible: NDArray[np.float64]  # [B] 1 where the view saw a Gaussian
-    gain: NDArray[np.float64]  # [B, 3] gradients of the log-gains
+    response: list[ResponseGradient | None]  # by the camera's response; None where it has none
 
     @staticmethod
     def zeros(views: int) -> _BatchResult:
         """Returns the result of no view."""
-        return _BatchResult(np.zeros(views), np.zeros(views), np.zeros((views, 3)))
+        return _BatchResult(np.zeros(views), np.zeros(views), [None] * views)
 
 
 class Stepper:
@@ -107,16 +108,16 @@ class Stepper:
             scores=importance is not None and importance.weighs,
             loo=importance is not None and importance.leaves_out,
             harmonics=schedule.moves_sh(iteration), depth_weight=schedule.depth_weight(iteration))
-        gain = None if state.exposure is None else state.exposure.gain(index)
+        response = None if state.photometry is None else state.photometry.response(index)
         compute = self._blurred.choose(view, index, iteration) or self._compute
-        result.loss[place], statistics = compute(state.optimizer, view, options, gain)
+        result.loss[place], statistics = compute(state.optimizer, view, options, response)
         if statistics is None or not np.isfinite(result.loss[place]):
             return None
         result.visible[place] = 1
         if importance is not None:
             importance.add(statistics)
-        if state.exposure is not None:
-            result.gain[place] = compute.log_gain_gradient
+        if response is not None:
+            result.response[place] = compute.response_gradient
         return statistics
 
     def _move(self, batch: list[int], result: _BatchResult, iteration: int) -> None:
@@ -125,8 +126,9 @@ class Stepper:
         for place, index in enumerate(batch):
             if not result.visible[place]:
                 continue
-            if state.exposure is not None:
-                state.exposure.step(index, result.gain[place], schedule.share(iteration))
+            gradient = result.response[place]
+            if state.photometry is not None and gradient is not None:
+                state.photometry.step(index, gradient, schedule.share(iteration))
         state.optimizer.step(
             schedule.means_rate(iteration), sh_rest=schedule.moves_sh(iteration),
             factor=schedule.rate_factor(iteration))

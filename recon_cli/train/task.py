@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.io.images import reduce_view
@@ -34,6 +36,8 @@ class Task:
     stereo: StereoPoints | None = None  # of the training views; None where they are not known
     depth_refused: str = ""  # why no view has sensor depth although the capture has some
     motions: ViewMotions | None = None  # of the views; None where no blur is looked for
+    # log2 of the exposure of each training view by EXIF, NaN where it is not known; None: of none
+    exposures: NDArray[np.float64] | None = None
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
         """Returns 1 for each position where Gaussians may be added, else 0."""

@@ -82,7 +82,10 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         depth_refused=sensor.refused,
         motions=ViewMotions(
             tuple(motions.get(view.name) for view in views),
-            tuple(motions.get(view.name) for view in validation), scene.points))
+            tuple(motions.get(view.name) for view in validation), scene.points),
+        exposures=np.array([
+            scene.exposures.get(view.face_of or view.name, np.nan) for view in views]
+        ) if scene.exposures else None)
 
 
 def load_sensor_depth(scene: Scene, config: RunConfig) -> SensorViews:

@@ -43,6 +43,8 @@ class Frame(JsonRecord):
     held_out: bool  # used for the score, never for training
     group: int = 0  # index of the group of frames that share its intrinsics
     masked: bool = False  # it has a mask of its name in the folder of masks
+    # log2 of exposure time, ISO and aperture by EXIF; None if unknown, or developed from RAW
+    exposure_ev: float | None = None
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,11 @@ class FrameList(JsonRecord):
 
     def write(self, stage: Path) -> None:
         """Writes the list into ingest's folder."""
-        atomic.write_json(stage / LIST, dataclasses.asdict(self))
+        value = dataclasses.asdict(self)
+        for frame in value["frames"]:
+            if frame["exposure_ev"] is None:  # as lists were before there was any
+                del frame["exposure_ev"]
+        atomic.write_json(stage / LIST, value)
 
 
 def read_frame_list(stage: Path) -> FrameList:

@@ -283,6 +283,39 @@ class MovingSummary(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
+class VignetteSummary(JsonRecord):
+    """The vignette of one camera: exp(a s + b s^2) of the light, s = 1 in the farthest corner."""
+
+    lens: tuple[float, ...]  # of `render.response.lens`
+    a: float
+    b: float
+    corner: float  # share of the light that is left in the corner
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotometrySummary(JsonRecord):
+    """What training took from the images and not from the scene, in photometry.json."""
+
+    FILE: typing.ClassVar[str] = "photometry.json"
+
+    gain_spread: float | None = None  # standard deviation of the log-gains over the views
+    bend_spread: float | None = None  # and of the bends of their tone curves
+    vignettes: tuple[VignetteSummary, ...] = ()  # of the cameras
+
+    @classmethod
+    def read(cls, folder: Path) -> PhotometrySummary | None:
+        """Returns the record in a folder of train or prune; None where nothing was fitted.
+
+        Raises:
+            ManifestError: the file is of another version.
+            FormatError: it is damaged.
+        """
+        path = folder / cls.FILE
+        hint = "Run `recon train --again`."
+        return cls.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainSummary(JsonRecord):
     """How a training ended; one in blocks adds up steps and times of all of them."""
 
@@ -310,6 +343,7 @@ class TrainSummary(JsonRecord):
     blocks: int | None = None  # that were trained apart; None for one model
     merge: MergeSummary | None = None  # of these
     moving: MovingSummary | None = None  # None where nothing is masked
+    photometry: PhotometrySummary | None = None  # None where none was fitted
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from recon_cli.train import async_trainer
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
+from recon_cli.train.photometry import Photometry
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
 from recon_cli.train.stepper import Stepper
@@ -306,7 +307,7 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
     def chosen(backend="triton", importance=None, *, exposure=False, **changes):
         config = dataclasses.replace(CONFIG, **changes)
         state, task = first(backend, config), task_of(backend, config)
-        state.exposure = Exposure(3) if exposure else None
+        state.photometry = Photometry.from_parts(Exposure(3) if exposure else None, None, None)
         found = async_trainer.choose_trainer(state, task, importance, lambda _: False)
         return type(found.__self__)
 

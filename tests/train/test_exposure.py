@@ -10,6 +10,7 @@ from recon_cli.io.images import fill_masked
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
+from recon_cli.render.response import Response
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.gradient import gradient_step, photometric_loss
@@ -37,11 +38,13 @@ def step_of(splats, view, backend, gain):
     """Loss, gradients of the splats and of the log-gain that a step leaves."""
     state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
-    loss, _ = compute(state.optimizer, view, StepOptions(3, 0.2), gain)
+    response = None if gain is None else Response(gain)
+    loss, _ = compute(state.optimizer, view, StepOptions(3, 0.2), response)
     held = state.optimizer.gradients.parameters().items()
     if not state.optimizer.fused:
         held = ((name, leaf.grad) for name, leaf in state.splats.parameters().items())
-    return loss, {name: value.clone() for name, value in held}, compute.log_gain_gradient
+    return loss, {name: value.clone() for name, value in held}, (
+        compute.response_gradient.log_gain)
 
 
 def exact_loss(splats, view, log_gain, ssim_weight=0.2):
@@ -95,12 +98,12 @@ def test_a_white_picture_of_a_gray_room_has_the_slope_of_its_brightness(backend)
     gain = np.array([0.1, 0.2, 0.05], np.float32)
     state = new_state(splats, CONFIG, 1.0, backend=backend)
     compute = gradient_step(backend)
-    compute(state.optimizer, view, StepOptions(3, 0.0), gain)
+    compute(state.optimizer, view, StepOptions(3, 0.0), Response(gain))
     with torch.no_grad():
         rgb = render(splats, CAMERA, torch.zeros(3), 3, backend=backend).rgb.numpy()
     assert rgb.max() * gain.max() < 1
     expected = -(rgb * gain).reshape(-1, 3).mean(axis=0) / 3
-    assert compute.log_gain_gradient == pytest.approx(expected, rel=1e-4)
+    assert compute.response_gradient.log_gain == pytest.approx(expected, rel=1e-4)
 
 
 @every_cpu_backend

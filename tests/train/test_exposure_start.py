@@ -149,3 +149,58 @@ def test_a_room_of_one_exposure_does_not_drift(shared_data, room):
     folder = shared_data / "rooms" / room
     assert not estimate_gains(
         filmed(folder, "video.mp4"), points_from_depth(read_posed(folder))[0]).drifts
+
+
+LIGHT = np.log2(GAINS.prod(axis=1) ** (1 / 3)) * 2.2  # exposures whose roots are the mean gains
+
+
+def two_walls():
+    """Four views of one wall and four of another, of which the second four are twice as bright."""
+    turned = replace(CAMERA, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]))
+    behind = points() * [1, 1, -1]
+    shots = [*(TrainView(CAMERA, wall(gain * 0.7)) for gain in GAINS),
+             *(TrainView(turned, wall(gain * 1.4)) for gain in GAINS)]
+    return shots, np.concatenate([points(), behind])
+
+
+def grey(gains):
+    return gains.mean(axis=1)
+
+
+def test_exif_tells_walls_apart_that_share_no_view():
+    shots, where = two_walls()
+    exif = np.concatenate([LIGHT, LIGHT + 2.2])
+    alone = grey(estimate_gains(shots, where).log_gains)
+    found = grey(estimate_gains(shots, where, exposures=exif).log_gains)
+    assert alone[:4].mean() == pytest.approx(alone[4:].mean(), abs=ROUNDING)
+    assert found[4:].mean() - found[:4].mean() == pytest.approx(np.log(2), rel=0.15)
+    # within a wall the points decide
+    assert found[:4] - found[:4].mean() == pytest.approx(alone[:4] - alone[:4].mean(), abs=1e-3)
+    assert found.mean() == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [
+    np.random.default_rng(0).normal(0, 2, 8), np.zeros(8), np.full(8, np.nan)],
+    ids=["of other photos", "all alike", "missing"])
+def test_exif_that_the_points_contradict_is_not_used(wrong):
+    shots, where = two_walls()
+    found = estimate_gains(shots, where, exposures=wrong)
+    assert found.log_gains == pytest.approx(
+        estimate_gains(shots, where).log_gains, abs=1e-9)
+
+
+def test_one_wrong_exposure_among_right_ones_moves_no_gain():
+    shots, where = two_walls()
+    exif = np.concatenate([LIGHT, LIGHT + 2.2])
+    right = estimate_gains(shots, where, exposures=exif).log_gains
+    exif[2] += 4
+    found = estimate_gains(shots, where, exposures=exif).log_gains
+    assert found == pytest.approx(right, abs=0.1)
+
+
+def test_a_photo_that_shares_no_point_has_the_gain_of_its_exif():
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    shots = [*views(), TrainView(replace(CAMERA, viewmat=turned), wall((0.5, 0.5, 0.5)))]
+    exif = np.append(LIGHT, -2.2)
+    found = grey(estimate_gains(shots, points(), exposures=exif).log_gains)
+    assert found[4] - found[3] == pytest.approx(np.log(0.5), rel=0.2)

@@ -17,6 +17,7 @@ def reasons(needs):
 def test_a_plain_scene_needs_nothing_and_pays_nothing():
     needs = examine(scene())
     assert needs.config.far == needs.config.exposure == "off"
+    assert needs.config.vignette == needs.config.tone == "off"
     assert needs.seconds == 0
     assert needs.moving is None
     assert "cover all" in reasons(needs)["far"]
@@ -38,6 +39,14 @@ def test_a_camera_that_sets_its_exposure_is_found_and_helped():
     assert needs.config.exposure == "on"
 
 
+def test_a_lens_with_dark_corners_is_found_and_helped():
+    needs = examine(scene(vignette=(-0.5, -0.3)))
+    decision = next(one for one in needs.decisions if one.name == "vignette")
+    assert decision.on, decision.reason
+    assert needs.config.vignette == "on"
+    assert needs.config.tone == "off"
+
+
 def test_one_exposure_for_all_needs_no_trial_but_a_drift():
     config = replace(CONFIG, look="even", far="off", moving="off")
     even, plain = examine(scene(drift=0.15, config=config)), examine(scene(config=config))
@@ -54,7 +63,8 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 def test_what_the_options_say_is_not_tried():
     config = replace(
-        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", blur="off")
+        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", blur="off",
+        vignette="off", tone="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config

@@ -14,6 +14,7 @@ from recon_cli.errors import ConfigError
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
+from recon_cli.render.response import Response
 from recon_cli.scene.motion import Motion
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import initialize
@@ -74,7 +75,8 @@ def test_the_gradients_are_those_of_the_mean_of_the_light(backend, gain):
         TrainView(camera, photo)] * 4)
     state = new_state(splats, task.schedule.config, 1.0, backend=backend)
     compute = BlurredSteps(task, gradient_step(backend)).choose(task.train[0], 0, 60)
-    loss, statistics = compute(state.optimizer, task.train[0], StepOptions(3, 0.2), gain)
+    loss, statistics = compute(state.optimizer, task.train[0], StepOptions(3, 0.2),
+                               None if gain is None else Response(gain))
     assert statistics is not None
 
     leaves = splats.map(lambda tensor: tensor.detach().double().requires_grad_())
@@ -95,7 +97,7 @@ def test_the_gradients_are_those_of_the_mean_of_the_light(backend, gain):
         theirs = getattr(leaves, name).grad
         assert (value.double() - theirs).norm() <= TOLERANCE * theirs.norm(), name
     if gain is not None:
-        assert compute.log_gain_gradient == pytest.approx(log_gain.grad.numpy(), rel=1e-4)
+        assert compute.response_gradient.log_gain == pytest.approx(log_gain.grad.numpy(), rel=1e-4)
 
 
 def test_only_the_last_part_of_a_run_is_blurred_and_all_of_a_continued_one():

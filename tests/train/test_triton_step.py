@@ -13,6 +13,7 @@ from recon_cli.render import render
 from recon_cli.render.camera_gradient import camera_gradient
 from recon_cli.render.contract import StepOptions
 from recon_cli.render.depth_loss import depth_loss
+from recon_cli.render.response import Response
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.train_view import SensorDepth, TrainView
 from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_loss
@@ -39,7 +40,8 @@ def step(splats, view, gain=None, **wanted):
     optimizer = SplatOptimizer(
         splats.map(lambda tensor: tensor.clone().to(DEVICE)), CONFIG, 1.0, backend="triton")
     compute = gradient_step("triton", DEVICE)
-    loss, statistics = compute(optimizer, view, StepOptions(DEGREE, WEIGHT, **wanted), gain)
+    loss, statistics = compute(optimizer, view, StepOptions(DEGREE, WEIGHT, **wanted),
+                               None if gain is None else Response(gain))
     return optimizer, compute, loss, statistics
 
 
@@ -84,7 +86,7 @@ def test_a_step_leaves_loss_gradients_and_statistics(mask, gain):
     ours = camera_gradient(optimizer.splats, optimizer.gradients, CAMERA, DEGREE)
     assert np.linalg.norm(ours - turned) <= 1e-3 * np.linalg.norm(turned)
     if gain is not None:
-        assert near(torch.from_numpy(compute.log_gain_gradient), true_gain)
+        assert near(torch.from_numpy(compute.response_gradient.log_gain), true_gain)
 
 
 def depth():

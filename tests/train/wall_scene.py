@@ -5,6 +5,7 @@ import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.render import render
+from recon_cli.render.response import transmission
 from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -45,7 +46,7 @@ def outside():
     return 60 * ahead, colors
 
 
-def scene(*, window=False, drift=0.0, config=CONFIG, views=VIEWS):
+def scene(*, window=False, drift=0.0, config=CONFIG, views=VIEWS, vignette=None):
     points, colors = wall(window)
     far_points, far_colors = outside()
     near, far = splats_at(points, colors, 0.06), splats_at(far_points, far_colors, 1.6)
@@ -59,6 +60,8 @@ def scene(*, window=False, drift=0.0, config=CONFIG, views=VIEWS):
         camera = Camera(128, 96, 90.0, 90.0, 64.0, 48.0, viewmat)
         with torch.no_grad():
             rgb = render(truth, camera, torch.zeros(3), 0, backend="numba").rgb.numpy()
+        if vignette is not None:
+            rgb = rgb * transmission(camera, vignette)[..., None]
         gain = np.exp(drift * rng.normal(size=3))
         shots.append(TrainView(camera, (np.clip(rgb * gain, 0, 1) * 255).round().astype(np.uint8)))
     task = Task(shots, [], Schedule(config), EXTENT, "numba", torch.device("cpu"))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recon_cli.render.contract import Statistics, StepOptions, TargetDepth, TargetImage
 from recon_cli.render.depth_loss import depth_loss_gradient
+from recon_cli.render.response import ResponseGradient, ResponsePass
 from recon_cli.kernels.kernel import kernel
 from recon_cli.render.numba.loss import CHANNELS, MAPS, photometric
 from recon_cli.kernels.simd_functions import fetch_add
@@ -32,7 +33,7 @@ class PhotometricStep:
     def __init__(self) -> None:
         self._pass = ViewPass()
         self.statistics = Statistics.zeros(torch.zeros(0, 3))  # of the last view; overwritten
-        self.log_gain_gradient = np.zeros(CHANNELS)  # float64, of the last view that had a gain
+        self.response_gradient = ResponseGradient.zeros()  # of the last view that had a response
 
     @property
     def instances(self) -> int:
@@ -68,9 +69,9 @@ class PhotometricStep:
         depth = view.take("nothing", 0) if target.depth is None else view.take("depth", pixels)
         image = ImageBuffers(rgb, view.take("alpha", pixels), depth)
         view.forward(packed, camera, settings, image, self.statistics)
-        if target.gain is not None:
-            # whole rows: ten times faster
-            rgb.reshape(height, -1)[:] *= np.tile(target.gain, width)
+        response = None if target.response is None else ResponsePass(target.response, camera)
+        if response is not None:
+            response.forward(rgb.reshape(height, -1))
         grad_rgb = view.take("grad_rgb", CHANNELS * pixels)
         if not truth.flags.writeable:  # would be another type, and kernels compiled once more
             truth = truth.copy()
@@ -83,9 +84,9 @@ class PhotometricStep:
             maps=view.take("maps", MAPS * len(rgb)), gradient=grad_rgb)
         if ignored is not None:
             grad_rgb[ignored] = 0
-        if target.gain is not None:
-            self._gain_backward(rgb.reshape(height, -1), grad_rgb.reshape(height, -1),
-                                np.tile(target.gain, width))
+        if response is not None:
+            self.response_gradient = response.backward(
+                rgb.reshape(height, -1), grad_rgb.reshape(height, -1))
         grad_alpha = grad_depth = view.take("nothing", 0)
         if target.depth is not None:
             grad_alpha, grad_depth = (
@@ -111,19 +112,6 @@ class PhotometricStep:
         grad_alpha[:], grad_depth[:] = 0, 0
         grad_alpha[known], grad_depth[known] = by_alpha.numpy(), by_depth.numpy()
         return float(loss)
-
-    def _gain_backward(
-        self, image: NDArray[np.float32], gradient: NDArray[np.float32],
-        gain: NDArray[np.float32],
-    ) -> None:
-        """Carries the gradient of y = g x back to x in place, and stores that of log g.
-
-        dL/dlog g = sum over pixels of y dL/dy. Under a mask y is the truth, but dL/dy 0. `image`
-        and `gradient` are [H, W * 3], `gain` is [W * 3].
-        """
-        columns = np.multiply(image, gradient).sum(axis=0, dtype=np.float64)
-        self.log_gain_gradient = columns.reshape(-1, CHANNELS).sum(axis=0)
-        gradient *= gain
 
 
 _SUM_BLOCK = 1 << 11  # Gaussians that are summed together, whichever thread takes them

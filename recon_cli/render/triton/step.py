@@ -19,6 +19,7 @@ from torch import Tensor
 
 from recon_cli.render.contract import Statistics, StepOptions, TargetDepth, TargetImage
 from recon_cli.render.depth_loss import depth_loss_gradient
+from recon_cli.render.response import Response, ResponseTensors
 from recon_cli.render.triton.cuda_graphs import Graphs
 from recon_cli.render.triton.gaussian import camera_buffer
 from recon_cli.render.triton.loss import loss_and_gradient
@@ -49,7 +50,7 @@ class _DeviceTarget:
 
     pixels: Tensor
     mask: Tensor | None
-    gain: Tensor | None
+    response: Response | None
     depth: Tensor | None
 
 
@@ -77,8 +78,8 @@ class PhotometricStep:
         self._photographs: dict[int, tuple[NDArray[Any], Tensor]] = {}
         self._room_for_photographs = 0 if device.type == "cpu" else int(
             _PHOTOGRAPHS * torch.cuda.get_device_properties(device).total_memory)
-        # of the last view that had a gain
-        self.log_gain_gradient = torch.zeros(3, dtype=torch.float64, device=device)
+        # of the last view that had a response; reading it waits for the device
+        self.response_tensors: ResponseTensors | None = None
 
     def __call__(
         self, splats: Splats, gradients: Splats, camera: Camera, target: TargetImage,
@@ -118,7 +119,7 @@ class PhotometricStep:
         key = (*places, len(splats), splats.sh_rest.shape, camera.width, camera.height,
                target.mask is None, noise, options.sh_degree, options.ssim_weight, options.details,
                options.harmonics, self._room)
-        if target.gain is None and not options.scores and not options.loo:
+        if target.response is None and not options.scores and not options.loo:
             self._graphs.run(key, work)
         else:
             work()
@@ -152,7 +153,7 @@ class PhotometricStep:
         return _DeviceTarget(
             self._copy_to_device("pixels", target.pixels),
             None if mask is None else self._copy_to_device("mask", mask),
-            None if target.gain is None else torch.from_numpy(target.gain).to(self._view.device),
+            target.response,
             None if target.depth is None else self._upload_depth(target.depth))
 
     def _upload_depth(self, target: TargetDepth) -> Tensor:
@@ -204,12 +205,18 @@ class PhotometricStep:
             image = composite_tiles(
                 lists, camera, self._background, target.mask, scores, keep=True,
                 plain=plain)
-            rgb = image.rgb if target.gain is None else image.rgb * target.gain
+            rgb, response = image.rgb, None
+            if target.response is not None:
+                response = ResponseTensors(target.response, camera, rgb)
+                shown = rgb.detach().requires_grad_()
+                with torch.enable_grad():
+                    photograph = response.apply(shown)
+                rgb = photograph.detach()
             loss, grad_rgb = loss_and_gradient(rgb, target.pixels, options.ssim_weight, target.mask)
-            if target.gain is not None:
-                # y = g x: dL/dlog g = g dL/dg = sum over pixels of y dL/dy
-                self.log_gain_gradient.copy_((rgb.double() * grad_rgb).sum((0, 1)))
-                grad_rgb = grad_rgb * target.gain
+            if response is not None:
+                photograph.backward(grad_rgb)
+                assert shown.grad is not None
+                grad_rgb, self.response_tensors = shown.grad, response
             grad_depth = grad_alpha = None
             if noise is not None and target.depth is not None:
                 off, grad_depth, grad_alpha = depth_loss_gradient(
