@@ -222,10 +222,10 @@ class TrainConfig(StageConfig):
         "auto", "A gain per image; auto: by trial.",
         choices=("auto", "on", "off"))
     vignette: str = option(
-        "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
+        "off", "The falloff of each camera's lens towards the corners; auto: by a trial.",
         choices=("auto", "on", "off"), late=True, expert=True)
     tone: str = option(
-        "auto", "A tone curve per image; auto: by a trial.",
+        "off", "A tone curve per image; auto: by a trial.",
         choices=("auto", "on", "off"), late=True, expert=True)
     depth: str = option(
         "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
