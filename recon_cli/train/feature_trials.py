@@ -36,11 +36,12 @@ from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_search import (
     Judge,
     Regions,
+    are_enough,
+    find_signs,
     hide,
     is_plausible,
     search,
     share_of,
-    shows_movement,
 )
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.shutter import BlurEvidence, ViewMotions
@@ -135,6 +136,7 @@ _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
+_LEAST_SEARCHED = 1000  # steps of a run in which what moves is looked for
 PARTS = ("far", "stereo", "exposure", "images", "depth", "blur")
 
 
@@ -214,10 +216,19 @@ def examine(scene: TrialScene) -> Needs:
                "the motion of the camera does not tell which views are blurred")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
-    # what is compared with tables of the literature sees what they saw
-    off = config.moving == "off" or (config.moving == "auto" and config.densify == "reference")
-    moving = None if off else bench.find_moving(config, decisions)
+    moving = bench.find_moving(config, decisions) if _may_mask(config) else None
     return Needs(config, tuple(decisions), moving)
+
+
+def _may_mask(config: RunConfig) -> bool:
+    """Returns whether what moves is looked for.
+
+    What is compared with tables of the literature sees what they saw, and in a short run few
+    Gaussians follow what moves.
+    """
+    return config.moving == "on" or (
+        config.moving == "auto" and config.densify != "reference"
+        and config.iterations >= _LEAST_SEARCHED)
 
 
 def _word(part: str, *, on: bool) -> str:
@@ -313,9 +324,10 @@ class _Bench:
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
         self._run(config)
         model = self._models[_key(config)]
-        if config.moving == "auto" and not shows_movement(model, views, judge):
-            decisions.append(replace(skip_trial("moving", "no views contradict the others"),
-                                     seconds=time.perf_counter() - start))
+        if config.moving == "auto" and not are_enough(signs := find_signs(model, views, judge)):
+            decisions.append(replace(skip_trial(
+                "moving", f"{signs.sum()} of {len(signs)} views contradict the others"),
+                seconds=time.perf_counter() - start))
             return None
         regions = search(model, views, range(len(task.train)), judge, partial(self._probe, config))
         if not any(region.any() for region in regions):

@@ -144,7 +144,8 @@ def contradict(
     """Returns how `own` contradicts those of `views` that `others` names, in some pixels [H, W]."""
     height, width = own.depth.shape
     pixels = np.flatnonzero((own.depth.reshape(-1) > 0) & suspects.reshape(-1))
-    amount, spread = (_length(own.error) * suspects).reshape(-1), np.zeros(height * width, np.float32)
+    amount = (_length(own.error) * suspects).reshape(-1)
+    spread = np.zeros(height * width, np.float32)
     seen = np.zeros(height * width, np.int64)
     if not len(pixels) or not len(others):
         return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
@@ -202,10 +203,11 @@ _MARGIN = 2  # pixels that a region is widened by
 # Half of a region must be this many times beyond the spread of the others, who must agree. After a
 # short run it was 15 and more for 40 made people and 30 for a monitor that shows something else
 # (desk_monitors), up to 10.8 for gloss, windows, vignettes and poor surfaces in nine captures.
-_AGREED, _SPREAD_FLOOR = 12.0, 0.001
+SURE, _SPREAD_FLOOR = 12.0, 0.001
 # A tenth of it must stand out clearly: shadows of whoever films stay below .21 (fox), people had
 # more than .3. And half of it must be seen by so many others.
 _CLEAR, _WITNESSES = 0.22, 4
+_REACH = 0.12  # of the longer side: a faint part is no farther from a strong one
 _ALONE = 0.8  # of _CLEAR: what a view errs by where it contradicts others
 # Share of the views of a surface that may show something else there. Where more do, as at a window
 # or a mirror, it is the model that is wrong.
@@ -262,7 +264,9 @@ def _is_large(region: NDArray[np.bool_], strong: NDArray[np.bool_]) -> bool:
     return bool(np.count_nonzero(region & strong) >= _AREA * region.size / 4)
 
 
-def find_regions(found: Contradiction, noise: float) -> NDArray[np.bool_]:
+def find_regions(
+    found: Contradiction, noise: float, agreed: float = SURE
+) -> NDArray[np.bool_]:
     """Returns where a view shows what moves, [H, W]: connected, large and contradicted."""
     strong, weak = _thresholds(found.amount - _BEYOND * found.spread, noise)
     ratio = found.amount / (found.spread + _SPREAD_FLOOR)
@@ -271,10 +275,11 @@ def find_regions(found: Contradiction, noise: float) -> NDArray[np.bool_]:
         # what others do not see belongs to a region that they contradict, and makes none
         told = region & (found.seen >= _LEAST) & (found.amount >= _TELLS)
         if (_is_large(told, strong)
-                and np.median(ratio[told]) >= _AGREED
+                and np.median(ratio[told]) >= agreed
                 and np.quantile(found.amount[told], 0.9) >= _CLEAR
                 and np.median(found.seen[told]) >= _WITNESSES):
-            result |= region
+            reach = round(_REACH * max(region.shape))
+            result |= region & (cv2.dilate((told & strong).astype(np.uint8), _disc(reach)) > 0)
     return np.asarray(cv2.dilate(result.astype(np.uint8), _disc(_MARGIN)) > 0)
 
 
@@ -322,23 +327,25 @@ def _disc(radius: int) -> NDArray[np.uint8]:
 
 
 def find_moving(
-    views: Sequence[ComparedView], witnesses: Sequence[ComparedView] | None = None
+    views: Sequence[ComparedView], witnesses: Sequence[ComparedView] | None = None, *,
+    agreed: float = SURE,
 ) -> list[NDArray[np.bool_]]:
     """Returns where each view shows what moves, [H, W]: it contradicts `witnesses`, or the others.
 
-    Nowhere where the model is too poor to tell.
+    Nowhere where the model is too poor to tell. `agreed` is how far beyond the spread of the others
+    a region must be.
     """
     others = views if witnesses is None else witnesses
     regions = [np.zeros(view.depth.shape, np.bool_) for view in views]
     noise = noise_level(others)
     if noise > TOO_NOISY:
         return regions
-    suspects = {row: found for row, view in enumerate(views)
-                if (found := find_suspects(view, noise)).any()}
+    suspects = {row: where for row, view in enumerate(views)
+                if (where := find_suspects(view, noise)).any()}
     partners = {row: find_others(views[row], others) for row in suspects}
     for row, where in suspects.items():
         found = contradict(others, views[row], partners[row], where)
-        regions[row] = find_regions(found, noise)
+        regions[row] = find_regions(found, noise, agreed)
     if witnesses is not None:
         return regions
-    return drop_common(views, {row: partners[row] for row in partners if regions[row].any()}, regions)
+    return drop_common(views, partners, regions)
