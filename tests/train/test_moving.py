@@ -104,16 +104,11 @@ def test_a_view_that_fits_its_render_is_not_compared():
 
 
 @pytest.mark.parametrize(("agreed", "found"), [(12, False), (5, True)])
-def test_others_that_disagree_hide_what_moves_until_that_is_likely(agreed, found):
-    some = views()
-    for row, view in enumerate(some):  # ghosts of two signs where others see the same place
-        if row != 5:
-            paint(view, slice(0, H), slice(0, W), 0.045 * (-1) ** row)
-    noise = moving.noise_level(some)
-    assert noise > moving.TOO_NOISY
-    some = [replace(view, error=0.5 * view.error) for view in some]
-    paint(some[5], slice(20, 60), slice(60, 80), 0.3)
-    assert find_moving(some, agreed=agreed)[5].any() == found
+def test_where_others_disagree_a_region_is_only_found_once_it_is_likely(agreed, found):
+    amount, spread = np.zeros((H, W), np.float32), np.zeros((H, W), np.float32)
+    amount[20:60, 60:80], spread[20:60, 60:80] = 0.3, 0.03
+    contradiction = moving.Contradiction(amount, spread, np.full((H, W), 8))
+    assert moving.find_regions(contradiction, 0.01, agreed).any() == found
 
 
 def test_what_too_few_others_see_is_not_judged():
