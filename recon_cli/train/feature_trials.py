@@ -322,8 +322,7 @@ class _Bench:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
-        self._run(config)
-        model = self._models[_key(config)]
+        model = self.model(config)
         if config.moving == "auto" and not are_enough(signs := find_signs(model, views, judge)):
             decisions.append(replace(skip_trial(
                 "moving", f"{signs.sum()} of {len(signs)} views contradict the others"),
@@ -395,6 +394,11 @@ class _Bench:
             self._models[key], self._scores[key] = self._train(self._short(config), level)
         return self._scores[key]
 
+    def model(self, config: RunConfig, level: int = LEVEL) -> Splats:
+        """Returns the Gaussians of a short run, which another trial may have made."""
+        self._run(config, level)
+        return self._models[_key(config, level)]
+
     def _short(self, config: RunConfig, finer: float = 1.0) -> RunConfig:
         """Returns the options of a short run, of more steps and Gaussians by a factor."""
         return replace(
@@ -453,6 +457,11 @@ class _Bench:
             return [None] * len(chosen.held_out)
         motions = task.motions.train if chosen.own else task.motions.validation
         return [motions[i] for i in chosen.held_out]
+
+
+def short_model(scene: TrialScene, level: int = LEVEL) -> Splats:
+    """Returns the Gaussians of a trial with the parts that are on, at a size reduced by `level`."""
+    return _Bench(scene).model(scene.task.schedule.config, level)
 
 
 def _settled(config: RunConfig) -> RunConfig:
