@@ -232,7 +232,7 @@ class TrainConfig(StageConfig):
         "budget, unless a trial shows a loss.",
         choices=("auto", "on", "off"), late=True, expert=True)
     moving: str = option(
-        "off", "Mask people and things that move; auto: where views contradict the others.",
+        "auto", "Mask people and things that move; auto: where views contradict the others.",
         choices=("auto", "on", "off"), late=True, expert=True)
     look: str = option(
         "walk", "Brightness: as filmed, or even.", choices=("walk", "even"),
@@ -417,7 +417,7 @@ class ImportConfig(StageConfig):
     max_size: int = option(
         600, "Longest side of rendered and scored views.", unit="pixels", minimum=16)
     moving: str = option(
-        "off", "Mask people and things that move; auto: where views contradict the others.",
+        "auto", "Mask people and things that move; auto: where views contradict the others.",
         choices=("auto", "on", "off"), late=True, expert=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
 

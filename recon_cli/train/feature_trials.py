@@ -11,7 +11,6 @@ against runs of full length.
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,93 +36,20 @@ from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_search import (
     Judge,
     Regions,
+    are_enough,
+    find_signs,
     hide,
     is_plausible,
     search,
     share_of,
-    shows_movement,
 )
 from recon_cli.train.photometric_evidence import PhotometricEvidence, find_photometry
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.shutter import BlurEvidence, ViewMotions
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
+from recon_cli.train.trial_decisions import THRESHOLD_DB, decide, skip_trial, split
 from recon_cli.workspace.summaries import TrialDecision
-
-# A gain under this is not worth a part that can go wrong. Two runs that differed by their seed
-# alone were .07 +- .06 dB apart (17 views, 500 steps at 200 pixels): the errors decide as well.
-THRESHOLD_DB = 0.05
-_ERRORS = 1.65  # standard errors, a chance of about one in twenty
-_ERRORS_AGAINST = 1.0  # of a loss; what is on without a trial needs less to go off
-LEAST_VIEWS = 8  # whose mean has a standard error that can be told; fewer, and the split is own
-_SPLIT = 6  # each sixth training view is held out by an own split, or sooner each third or more
-_DENSEST = 3  # of few views; the rest must still hang together
-
-Arm = Callable[[], Sequence[float]]
-
-
-def skip_trial(name: str, reason: str) -> TrialDecision:
-    """Returns the decision against a part that nothing speaks for, untried."""
-    return TrialDecision(
-        name=name, on=False, mean_db=None, standard_error_db=None, reason=reason, seconds=0.0)
-
-
-def decide(
-    name: str, arms: tuple[Arm, Arm], *, threshold_db: float = THRESHOLD_DB,
-    errors: float = _ERRORS, unless_worse: bool = False,
-    clock: Callable[[], float] = time.perf_counter,
-) -> TrialDecision:
-    """Returns whether the second arm is better than the first.
-
-    On, if the mean gain is above the threshold and above `errors` standard errors of the paired
-    differences; with `unless_worse` also if it is not below zero by the threshold and one standard
-    error. Each arm, without and with the part, trains and returns the scores of the same views in
-    dB.
-
-    Raises:
-        ValueError: the arms score different numbers of views, or fewer than two.
-    """
-    start = clock()
-    without, with_it = (np.asarray(arm(), np.float64) for arm in arms)
-    if without.shape != with_it.shape or len(without) < 2:
-        raise ValueError(f"arms with {without.shape} and {with_it.shape} scores")
-    gains = with_it - without
-    mean = float(gains.mean())
-    error = float(gains.std(ddof=1)) / math.sqrt(len(gains))
-    needed = (-max(threshold_db, _ERRORS_AGAINST * error) if unless_worse
-              else max(threshold_db, errors * error))
-    on = mean > needed  # False for what is not a number
-    reason = (f"{mean:+.2f} dB +- {error:.2f} over {len(gains)} views, "
-              f"{'more' if on else 'not more'} than the {needed:.2f} dB that count")
-    return TrialDecision(
-        name=name, on=on, mean_db=mean, standard_error_db=error, reason=reason,
-        seconds=clock() - start)
-
-
-@dataclass(frozen=True)
-class Split:
-    """Which views a trial trains on and which it scores, as indices."""
-
-    train: tuple[int, ...]  # into the training views
-    held_out: tuple[int, ...]  # into the validation views, or into the training views where `own`
-    own: bool  # the validation views were too few; the final run trains on the held-out ones again
-
-
-def split(training: int, validation: int) -> Split | None:
-    """Returns the views of a trial; None where there are too few for any.
-
-    The validation views are scored if there are LEAST_VIEWS. Otherwise each sixth training view in
-    the order of the capture is, down to each third; the final run then trains on all of them.
-    """
-    if validation >= LEAST_VIEWS:
-        return Split(tuple(range(training)), tuple(range(validation)), own=False)
-    step = max(_DENSEST, min(_SPLIT, training // LEAST_VIEWS))
-    held_out = tuple(range(step // 2, training, step))
-    if len(held_out) < LEAST_VIEWS:
-        return None
-    train = tuple(i for i in range(training) if i not in held_out)
-    return Split(train, held_out, own=True)
-
 
 # Gain that blur needs: a room that gained 2.6 dB on sharp views gained 1.6 in its trial; two walks
 # gained 0 and .1, and their sharp views nothing.
@@ -138,6 +64,7 @@ _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
 _POINTS = 5000
 _CAP = 10_000
+_LEAST_SEARCHED = 1000  # steps of a run in which what moves is looked for
 PARTS = ("far", "stereo", "exposure", "vignette", "tone", "images", "depth", "blur")
 
 
@@ -226,10 +153,19 @@ def examine(scene: TrialScene) -> Needs:
                "the motion of the camera does not tell which views are blurred")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
-    # what is compared with tables of the literature sees what they saw
-    off = config.moving == "off" or (config.moving == "auto" and config.densify == "reference")
-    moving = None if off else bench.find_moving(config, decisions)
+    moving = bench.find_moving(config, decisions) if _may_mask(config) else None
     return Needs(config, tuple(decisions), moving)
+
+
+def _may_mask(config: RunConfig) -> bool:
+    """Returns whether what moves is looked for.
+
+    What is compared with tables of the literature sees what they saw, and in a short run few
+    Gaussians follow what moves.
+    """
+    return config.moving == "on" or (
+        config.moving == "auto" and config.densify != "reference"
+        and config.iterations >= _LEAST_SEARCHED)
 
 
 def _word(part: str, *, on: bool) -> str:
@@ -333,11 +269,11 @@ class _Bench:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
-        self._run(config)
-        model = self._states[_key(config)].splats
-        if config.moving == "auto" and not shows_movement(model, views, judge):
-            decisions.append(replace(skip_trial("moving", "no views contradict the others"),
-                                     seconds=time.perf_counter() - start))
+        model = self.model(config)
+        if config.moving == "auto" and not are_enough(signs := find_signs(model, views, judge)):
+            decisions.append(replace(skip_trial(
+                "moving", f"{signs.sum()} of {len(signs)} views contradict the others"),
+                seconds=time.perf_counter() - start))
             return None
         regions = search(model, views, range(len(task.train)), judge, partial(self._probe, config))
         if not any(region.any() for region in regions):
@@ -415,6 +351,11 @@ class _Bench:
                 None if state.photometry is None else state.photometry.falloffs, as_is=as_is)
         return self._scores[scored]
 
+    def model(self, config: RunConfig, level: int = LEVEL) -> Splats:
+        """Returns the Gaussians of a short run, which another trial may have made."""
+        self._run(config, level)
+        return self._states[_key(config, level)].splats
+
     def _short(self, config: RunConfig, finer: float = 1.0) -> RunConfig:
         """Returns the options of a short run, of more steps and Gaussians by a factor."""
         return replace(
@@ -477,6 +418,11 @@ class _Bench:
             return [None] * len(chosen.held_out)
         motions = task.motions.train if chosen.own else task.motions.validation
         return [motions[i] for i in chosen.held_out]
+
+
+def short_model(scene: TrialScene, level: int = LEVEL) -> Splats:
+    """Returns the Gaussians of a trial with the parts that are on, at a size reduced by `level`."""
+    return _Bench(scene).model(scene.task.schedule.config, level)
 
 
 def _settled(config: RunConfig) -> RunConfig:

@@ -138,12 +138,14 @@ class Contradiction:
 
 
 def contradict(
-    views: Sequence[ComparedView], own: ComparedView, others: NDArray[np.int64]
+    views: Sequence[ComparedView], own: ComparedView, others: NDArray[np.int64],
+    suspects: NDArray[np.bool_],
 ) -> Contradiction:
-    """Returns how `own` contradicts those of `views` that `others` names."""
+    """Returns how `own` contradicts those of `views` that `others` names, in some pixels [H, W]."""
     height, width = own.depth.shape
-    pixels = np.flatnonzero(own.depth.reshape(-1) > 0)
-    amount, spread = _length(own.error).reshape(-1), np.zeros(height * width, np.float32)
+    pixels = np.flatnonzero((own.depth.reshape(-1) > 0) & suspects.reshape(-1))
+    amount = (_length(own.error) * suspects).reshape(-1)
+    spread = np.zeros(height * width, np.float32)
     seen = np.zeros(height * width, np.int64)
     if not len(pixels) or not len(others):
         return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
@@ -201,10 +203,12 @@ _MARGIN = 2  # pixels that a region is widened by
 # Half of a region must be this many times beyond the spread of the others, who must agree. After a
 # short run it was 15 and more for 40 made people and 30 for a monitor that shows something else
 # (desk_monitors), up to 10.8 for gloss, windows, vignettes and poor surfaces in nine captures.
-_AGREED, _SPREAD_FLOOR = 12.0, 0.001
+SURE, _SPREAD_FLOOR = 12.0, 0.001
 # A tenth of it must stand out clearly: shadows of whoever films stay below .21 (fox), people had
 # more than .3. And half of it must be seen by so many others.
 _CLEAR, _WITNESSES = 0.22, 4
+_REACH = 0.12  # of the longer side: a faint part is no farther from a strong one
+_ALONE = 0.8  # of _CLEAR: what a view errs by where it contradicts others
 # Share of the views of a surface that may show something else there. Where more do, as at a window
 # or a mirror, it is the model that is wrong.
 _FEW = 0.5
@@ -221,34 +225,61 @@ def _length(error: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.square(error).mean(axis=-1)), np.float32)
 
 
-def _may_move(view: ComparedView, noise: float) -> bool:
-    """Returns whether a view differs enough from its render to be compared with others at all."""
-    strong = _length(view.error) > max(_LEAST_STRONG, _STRONG * noise)
-    return bool(_morphed(strong, cv2.MORPH_OPEN, 1).mean() >= _AREA / 4)
+def find_suspects(view: ComparedView, noise: float) -> NDArray[np.bool_]:
+    """Returns where a view differs enough from its render to be compared with others, [H, W].
+
+    What moves errs by itself about as much as it contradicts others, so that most regions of most
+    views need no look at the others.
+    """
+    error = _length(view.error)
+    strong, weak = _thresholds(error, noise)
+    result = np.zeros(weak.shape, np.bool_)
+    for region in _components(weak):
+        if _is_large(region, strong) and np.quantile(
+                error[region & (error >= _TELLS)], 0.9) >= _ALONE * _CLEAR:
+            result |= region
+    return np.asarray(cv2.dilate(result.astype(np.uint8), _disc(_MARGIN)) > 0)
 
 
-def find_regions(found: Contradiction, noise: float) -> NDArray[np.bool_]:
+def _thresholds(
+    beyond: NDArray[np.float32], noise: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Returns where an error is strong, and where it is weak or strong."""
+    strong = _morphed(beyond > max(_LEAST_STRONG, _STRONG * noise), cv2.MORPH_OPEN, 1)
+    weak = strong | (beyond > max(_LEAST_WEAK, _WEAK * noise))
+    return strong, _morphed(weak, cv2.MORPH_CLOSE, 2)
+
+
+def _components(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Returns the connected parts of a mask that are large and thick."""
+    small = mask.astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=4)
+    inside = cv2.distanceTransform(small, cv2.DIST_L2, 3)
+    return [region for label in range(1, count)
+            if stats[label, cv2.CC_STAT_AREA] >= _AREA * mask.size
+            and inside[region := labels == label].max() >= _THICK]
+
+
+def _is_large(region: NDArray[np.bool_], strong: NDArray[np.bool_]) -> bool:
+    return bool(np.count_nonzero(region & strong) >= _AREA * region.size / 4)
+
+
+def find_regions(
+    found: Contradiction, noise: float, agreed: float = SURE
+) -> NDArray[np.bool_]:
     """Returns where a view shows what moves, [H, W]: connected, large and contradicted."""
-    beyond = found.amount - _BEYOND * found.spread
-    strong = beyond > max(_LEAST_STRONG, _STRONG * noise)
-    strong = _morphed(strong, cv2.MORPH_OPEN, 1)
-    weak = _morphed(strong | (beyond > max(_LEAST_WEAK, _WEAK * noise)), cv2.MORPH_CLOSE, 2)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(
-        weak.astype(np.uint8), connectivity=4)
-    inside = cv2.distanceTransform(weak.astype(np.uint8), cv2.DIST_L2, 3)
+    strong, weak = _thresholds(found.amount - _BEYOND * found.spread, noise)
     ratio = found.amount / (found.spread + _SPREAD_FLOOR)
     result = np.zeros(weak.shape, np.bool_)
-    for label in range(1, count):
-        region = labels == label
+    for region in _components(weak):
         # what others do not see belongs to a region that they contradict, and makes none
         told = region & (found.seen >= _LEAST) & (found.amount >= _TELLS)
-        if (stats[label, cv2.CC_STAT_AREA] >= _AREA * region.size
-                and np.count_nonzero(told & strong) >= _AREA * region.size / 4
-                and inside[region].max() >= _THICK
-                and np.median(ratio[told]) >= _AGREED
+        if (_is_large(told, strong)
+                and np.median(ratio[told]) >= agreed
                 and np.quantile(found.amount[told], 0.9) >= _CLEAR
                 and np.median(found.seen[told]) >= _WITNESSES):
-            result |= region
+            reach = round(_REACH * max(region.shape))
+            result |= region & (cv2.dilate((told & strong).astype(np.uint8), _disc(reach)) > 0)
     return np.asarray(cv2.dilate(result.astype(np.uint8), _disc(_MARGIN)) > 0)
 
 
@@ -296,21 +327,25 @@ def _disc(radius: int) -> NDArray[np.uint8]:
 
 
 def find_moving(
-    views: Sequence[ComparedView], witnesses: Sequence[ComparedView] | None = None
+    views: Sequence[ComparedView], witnesses: Sequence[ComparedView] | None = None, *,
+    agreed: float = SURE,
 ) -> list[NDArray[np.bool_]]:
     """Returns where each view shows what moves, [H, W]: it contradicts `witnesses`, or the others.
 
-    Nowhere where the model is too poor to tell.
+    Nowhere where the model is too poor to tell. `agreed` is how far beyond the spread of the others
+    a region must be.
     """
     others = views if witnesses is None else witnesses
     regions = [np.zeros(view.depth.shape, np.bool_) for view in views]
     noise = noise_level(others)
     if noise > TOO_NOISY:
         return regions
-    chosen = [row for row, view in enumerate(views) if _may_move(view, noise)]
-    partners = {row: find_others(views[row], others) for row in chosen}
-    for row in chosen:
-        regions[row] = find_regions(contradict(others, views[row], partners[row]), noise)
+    suspects = {row: where for row, view in enumerate(views)
+                if (where := find_suspects(view, noise)).any()}
+    partners = {row: find_others(views[row], others) for row in suspects}
+    for row, where in suspects.items():
+        found = contradict(others, views[row], partners[row], where)
+        regions[row] = find_regions(found, noise, agreed)
     if witnesses is not None:
         return regions
     return drop_common(views, partners, regions)

@@ -5,7 +5,8 @@
 A scene is a folder of rooms (exact poses and depth; its novel views are scored) or a workspace with
 a trained model, whose depth says what hides what; its held-out views are scored. People are in a
 third of the training views; the views that are scored hold nobody. The chair stands in one place in
-the first half of the capture and in another in the second.
+the first half of the capture and in another in the second. The last training has exact masks: more
+than that masks cannot gain.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import dataclasses
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -27,10 +29,12 @@ from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext
 from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr, render_view
 from recon_cli.io.images import read_image, read_mask, write_png
+from recon_cli.io.views import ReferenceView
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
 from recon_cli.stereo.depths import places
 from recon_cli.train.moving_masks import FOLDER, file_name
@@ -38,10 +42,14 @@ from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace.summaries import TrainPlan
 
 Array = NDArray[np.float64]
+Things = Sequence[made_people.Thing]
+Drawn = dict[str, NDArray[np.bool_]]  # [2, H, W] things and their shadows, by name of the view
 _POINTS = 300  # of each depth map, that a room begins with
 _EVENT = 11  # views in which one person crosses
 _NEAR = 1.35  # metres from the camera to a person, about a tenth of the pixels
-_CAMERA_HEIGHT = 1.45  # metres, of whoever films, where a scene has no scale
+_CAMERA_HEIGHT = 1.45  # metres above the floor
+_LOWEST = 2.0  # percent of the points are below the floor
+_SAMPLED = 2  # each second place of people is looked at in held-out views
 
 
 def room_scene(folder: Path) -> Scene:
@@ -75,96 +83,148 @@ def room_scene(folder: Path) -> Scene:
 def exact_depth(view: View) -> NDArray[np.float32] | None:
     """Returns the depth of a view of a room in metres, 0 for none; None where it has no file."""
     path = view.original.with_name(view.original.stem.replace("frame", "depth") + ".png")
-    if not path.exists():
+    if path == view.original or not path.exists():
         return None
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 6553.5, np.float32)
 
 
-def draw_into(
-    scene: Scene, splats: Splats, things: Callable[[int], Sequence[made_people.Thing]], out: Path
-) -> tuple[Scene, dict[str, NDArray[np.bool_]]]:
-    """Returns a scene whose training photos hold things, by their place, and where they do."""
-    out.mkdir(parents=True)
-    drawn, views = {}, []
-    for row, view in enumerate(scene.train):
-        here = things(row)
-        if here:
-            image, solid, shadow = draw_one(view, splats, here)
-            if solid.any():
-                drawn[view.name] = np.stack([solid, shadow])
-                write_png(out / view.name, image)
-                view = dataclasses.replace(view, original=out / view.name,
-                                           denoised=out / view.name)
-        views.append(view)
-    return dataclasses.replace(scene, train=tuple(views)), drawn
+@dataclass(frozen=True, eq=False)
+class Metres:
+    """A world in metres, z up, with the floor at 0."""
+
+    turn: Array  # [3, 3] from the scene's axes
+    unit: float  # of the scene in a metre
+    shift: float  # metres, added along z
+
+    @staticmethod
+    def from_scene(scene: Scene) -> Metres:
+        """Returns that of a scene whose floor is where its lowest points are."""
+        up = scene.up
+        if up is None:
+            up = -np.mean([view.camera.viewmat[1, :3] for view in scene.train], axis=0)
+        turn = _turn_to_z(up / np.linalg.norm(up))
+        floor = float(np.percentile(scene.points @ turn[2], _LOWEST))
+        height = float(np.median([view.camera.center @ turn[2] for view in scene.train])) - floor
+        unit = height / _CAMERA_HEIGHT
+        return Metres(turn, unit, -floor / unit)
+
+    def camera(self, camera: Camera) -> Camera:
+        """Returns a camera in this world."""
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = camera.viewmat[:3, :3] @ self.turn.T
+        viewmat[:3, 3] = camera.viewmat[:3, 3] / self.unit - self.shift * viewmat[:3, 2]
+        return dataclasses.replace(camera, viewmat=viewmat)
 
 
-def draw_one(
-    view: View, splats: Splats, things: Sequence[made_people.Thing]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns a photo with things in it, and where they and their shadows are."""
-    depth = exact_depth(view)
-    if depth is None:
-        depth = np.asarray(
-            render_surface(splats, view.camera, backend="numba").depth.numpy(), np.float32)
-    photo = read_image(view.original, view.camera.width, view.camera.height)
-    return made_people.draw(photo, depth, view.camera, things)
+def _turn_to_z(up: Array) -> Array:
+    aside = np.eye(3)[np.abs(up).argmin()]
+    x = np.cross(aside, up) / np.linalg.norm(np.cross(aside, up))
+    return np.stack([x, np.cross(up, x), up])
 
 
-def _unit(scene: Scene) -> float:
-    """Returns the units of a metre, by the height of the cameras above the floor at 0."""
-    return float(np.median([view.camera.center[2] for view in scene.train]) / _CAMERA_HEIGHT)
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A scene into which things are drawn."""
+
+    scene: Scene
+    splats: Splats  # whose depth says what hides what, where none is exact
+    metres: Metres
+
+    def draw_into(self, things: Sequence[Things], out: Path) -> tuple[Scene, Drawn]:
+        """Returns the scene with things in each training photo, and where they are by name."""
+        out.mkdir(parents=True)
+        drawn, views = {}, []
+        for view, here in zip(self.scene.train, things, strict=True):
+            if here:
+                image, solid, shadow = self.draw_one(view, here)
+                if solid.any():
+                    drawn[view.name] = np.stack([solid, shadow])
+                    write_png(out / view.name, image)
+                    view = dataclasses.replace(view, original=out / view.name,
+                                               denoised=out / view.name)
+            views.append(view)
+        return dataclasses.replace(self.scene, train=tuple(views)), drawn
+
+    def draw_one(
+        self, view: View, things: Things
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Returns a photo with things in it, and where they and their shadows are."""
+        depth = exact_depth(view)
+        if depth is None:
+            depth = np.asarray(
+                render_surface(self.splats, view.camera, backend="numba").depth.numpy(), np.float32)
+        photo = read_image(view.original, view.camera.width, view.camera.height)
+        return made_people.draw(
+            photo, depth / np.float32(self.metres.unit), self.metres.camera(view.camera), things)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Those of training, in metres."""
+        return [self.metres.camera(view.camera) for view in self.scene.train]
 
 
-def people(scene: Scene) -> Callable[[int], Sequence[made_people.Thing]]:
-    """Returns who is in which training view: one person after another, in a third of them."""
-    count = len(scene.train)
-    unit = _unit(scene)
+def _events(count: int) -> list[range]:
+    """Returns stretches of training views that are a third of all."""
     events = max(1, round(count / 3 / _EVENT))
     length = round(count / 3 / events)
-    here: dict[int, made_people.Thing] = {}
-    for event in range(events):
-        first = round((event + 0.5) * count / events - length / 2)
-        way = made_people.cross_view(
-            scene.train[first].camera, scene.train[first + length - 1].camera, length,
-            _NEAR * unit)
-        for step, (foot, heading, walked) in enumerate(way):
-            here[first + step] = made_people.person(foot, heading, walked, 1.7 * unit)
-    return lambda row: [here[row]] if row in here else []
+    firsts = [round((event + 0.5) * count / events - length / 2) for event in range(events)]
+    return [range(first, first + length) for first in firsts]
 
 
-def chairs(scene: Scene) -> tuple[Callable[[int], Sequence[made_people.Thing]], list[Array]]:
+def people(cameras: Sequence[Camera]) -> list[Things]:
+    """Returns who is in which training view: one person after another, in a third of them."""
+    here: list[Things] = [[] for _ in cameras]
+    for rows in _events(len(cameras)):
+        way = made_people.cross_view(cameras[rows[0]], cameras[rows[-1]], len(rows), _NEAR)
+        for row, (foot, heading, walked) in zip(rows, way, strict=True):
+            here[row] = [made_people.person(foot, heading, walked)]
+    return here
+
+
+def standing(cameras: Sequence[Camera]) -> list[Things]:
+    """Returns who is in which training view: people who stand still, each in several views."""
+    here: list[Things] = [[] for _ in cameras]
+    for rows in _events(len(cameras)):
+        middle = rows[len(rows) // 2]
+        (foot, heading, _), = made_people.cross_view(
+            cameras[middle], cameras[middle], 1, _NEAR, bearing=0.1)
+        for row in rows:
+            here[row] = [made_people.person(foot, heading, 0.2)]
+    return here
+
+
+def chairs(cameras: Sequence[Camera], points: Array) -> tuple[list[Things], list[Array]]:
     """Returns which chair is in which training view, and the two places where it stands.
 
     The floor is searched for places that many views of each half see from a distance.
     """
-    half, unit = len(scene.train) // 2, _unit(scene)
-    low, high = np.percentile(scene.points[:, :2], [10, 90], axis=0)
+    half = len(cameras) // 2
+    low, high = np.percentile(points[:, :2], [10, 90], axis=0)
     places = [np.array([x, y]) for x in np.linspace(low[0], high[0], 9)
               for y in np.linspace(low[1], high[1], 9)]
-
-    def seen(place: Array) -> tuple[int, int]:
-        rows = [_shows(view.camera, np.array([*place, 0.45 * unit]), unit) for view in scene.train]
-        return sum(rows[:half]), sum(rows[half:])
-
-    counts = np.array([seen(place) for place in places])
+    counts = np.array([_seen_by_half(cameras, place) for place in places])
     # each where one half saw it more, and both saw it
     first = int(np.argmax(np.where(counts[:, 0] > counts[:, 1], counts.min(axis=1), -1)))
     second = int(np.argmax(np.where(counts[:, 1] > counts[:, 0], counts.min(axis=1), -1)))
     chosen = [places[first], places[second]]
-    stands = [made_people.chair(place, 0.7, 0.9 * unit) for place in chosen]
-    return lambda row: [stands[0] if row < half else stands[1]], chosen
+    stands = [made_people.chair(place, 0.7) for place in chosen]
+    return [[stands[0] if row < half else stands[1]] for row in range(len(cameras))], chosen
 
 
-def _shows(camera: Camera, place: Array, unit: float) -> bool:
+def _seen_by_half(cameras: Sequence[Camera], place: Array) -> tuple[int, int]:
+    rows = [_shows(camera, np.array([*place, 0.45])) for camera in cameras]
+    return sum(rows[:len(rows) // 2]), sum(rows[len(rows) // 2:])
+
+
+def _shows(camera: Camera, place: Array) -> bool:
     """Returns whether a camera has a place well inside its image, not too near."""
     x, y, z = camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3]
-    return bool(z > 1.2 * unit and 0.1 < (camera.fx * x / z + camera.cx) / camera.width < 0.9
+    return bool(z > 1.2 and 0.1 < (camera.fx * x / z + camera.cx) / camera.width < 0.9
                 and 0.1 < (camera.fy * y / z + camera.cy) / camera.height < 0.9)
 
 
 def ghosts(
-    scene: Scene, splats: Splats, model: Splats, config: TrainConfig, standing: Sequence[Array]
+    stage: Stage, model: Splats, config: TrainConfig, places: Sequence[Array]
 ) -> list[float]:
     """Returns how much of the rarer state shows where the chair stood, 0 to 1, for each place.
 
@@ -172,18 +232,14 @@ def ghosts(
     photo with the chair: it is a mixture of both.
     """
     found = []
-    unit, half = _unit(scene), len(scene.train) // 2
-    for index, place in enumerate(standing):
-        thing = made_people.chair(place, 0.7, 0.9 * unit)
-        middle = np.array([*place, 0.45 * unit])
-        rows = [_shows(view.camera, middle, unit) for view in scene.train]
-        by_half = sum(rows[:half]), sum(rows[half:])
+    for index, place in enumerate(places):
+        by_half = _seen_by_half(stage.cameras, place)
         there = by_half[index] > by_half[1 - index]
         top = bottom = 0.0
-        for view in scene.test:
-            if not _shows(view.camera, middle, unit):
+        for view in stage.scene.test:
+            if not _shows(stage.metres.camera(view.camera), np.array([*place, 0.45])):
                 continue
-            with_it, solid, _ = draw_one(view, splats, [thing])
+            with_it, solid, _ = stage.draw_one(view, [made_people.chair(place, 0.7)])
             empty = read_image(view.original, view.camera.width, view.camera.height)
             usual, rare = (with_it, empty) if there else (empty, with_it)
             rgb = 255 * render_view(model, view.camera, config.sh_degree or 0, "numba").rgb.numpy()
@@ -227,41 +283,91 @@ def open_scene(folder: Path) -> tuple[Scene, Splats | None]:
     return scene, splats
 
 
+def mark_places(
+    stage: Stage, held_out: Sequence[ReferenceView], things: Sequence[Things]
+) -> list[TrainView]:
+    """Returns held-out views of which only the pixels count where a thing stood at some time."""
+    by_name = {view.name: view for view in stage.scene.test}
+    every = [thing for here in things[::_SAMPLED] for thing in here]
+    marked = []
+    for view in held_out:
+        _, solid, _ = stage.draw_one(by_name[view.name], every)
+        there = cv2.resize(solid.astype(np.uint8), (view.camera.width, view.camera.height),
+                           interpolation=cv2.INTER_NEAREST) > 0
+        if leaves_enough(there):
+            marked.append(dataclasses.replace(view, mask=there))
+    return marked
+
+
+def with_ideal_masks(made: Scene, drawn: Drawn, out: Path) -> Scene:
+    """Returns a scene of which exactly what was drawn is masked, 2 pixels more around."""
+    out.mkdir(parents=True)
+    views = []
+    for view in made.train:
+        if view.name in drawn:
+            hidden = cv2.dilate(drawn[view.name].any(axis=0).astype(np.uint8), np.ones((5, 5)))
+            write_png(out / view.name, ((hidden == 0) * 255).astype(np.uint8))
+            view = dataclasses.replace(view, mask=out / view.name)
+        views.append(view)
+    return dataclasses.replace(made, train=tuple(views))
+
+
+def choose_things(stage: Stage, kind: str) -> tuple[list[Things], list[Array]]:
+    """Returns the things in each training view, and the places of a chair."""
+    if kind == "chair":
+        metres = stage.metres
+        points = stage.scene.points @ metres.turn.T / metres.unit  # up to the shift along z
+        return chairs(stage.cameras, points)
+    return {"people": people, "standing": standing}[kind](stage.cameras), []
+
+
 @workbench.click.command()
 @workbench.click.argument("folder", type=workbench.FOLDER)
 @workbench.click.argument("out", type=workbench.click.Path(path_type=Path))
-@workbench.click.option("--things", type=workbench.click.Choice(["people", "chair"]),
-                        default="people")
+@workbench.click.option("--things", "kind", default="people",
+                        type=workbench.click.Choice(["people", "standing", "chair"]))
 @workbench.click.option("--iterations", default=1000)
 @workbench.click.option("--max-size", default=320)
-def main(folder: Path, out: Path, things: str, iterations: int, max_size: int) -> None:
+@workbench.click.option("--only", multiple=True, help="Trainings, of those in the table.")
+def main(
+    folder: Path, out: Path, kind: str, iterations: int, max_size: int, only: tuple[str, ...]
+) -> None:
     """Trains clean, without masks and with them, in OUT, and scores views that hold nobody."""
     workbench.numba_context()
     scene, splats = open_scene(folder)
     config = TrainConfig(
         iterations=iterations, max_size=max_size, sh_degree=1, far="off", exposure="off",
-        stereo="off", validation=0.0)
-    clean, seconds, _ = train(scene, config, out / "clean")
-    splats = splats or clean
-    chosen, standing = chairs(scene) if things == "chair" else (people(scene), [])
-    shutil.rmtree(out / "photos", ignore_errors=True)
-    made, drawn = draw_into(scene, splats, chosen, out / "photos")
-    workbench.print_head("training", "path dB", "novel dB", "things masked", "shadows", "others",
-                         "ghost A", "ghost B", "CPU s")
+        stereo="off", validation=0.0, moving="off")
+    if (out / "clean/splats.ply").exists():
+        clean, seconds = read_ply(out / "clean/splats.ply"), 0.0
+    else:
+        clean, seconds, _ = train(scene, config, out / "clean")
+    stage = Stage(scene, splats or clean, Metres.from_scene(scene))
+    things, places = choose_things(stage, kind)
+    for name in ("photos", "ideal-masks"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    made, drawn = stage.draw_into(things, out / "photos")
+    workbench.print_head("training", "path dB", "novel dB", "where things were", "things masked",
+                         "shadows", "others", "ghost A", "ghost B", "CPU s")
     held_out = load_reference_views(scene.test, max_size)
-    sides = [[view for view in held_out if view.name.startswith("test_") is novel]
-             for novel in (False, True)]
+    sides: list[Sequence[TrainView]] = [
+        [view for view in held_out if view.name.startswith("test_") is novel]
+        for novel in (False, True)]
+    sides.append(mark_places(stage, held_out, things))
 
     def show(name: str, model: Splats, seconds: float) -> None:
         scores = [f"{mean_psnr(model, side, 1, 'numba'):.2f}" if side else "" for side in sides]
-        marks = [f"{value:.2f}" for value in ghosts(scene, splats, model, config, standing)]
+        marks = [f"{value:.2f}" for value in ghosts(stage, model, config, places)]
         masked = [f"{100 * share:.1f}%" for share in found_shares(scene, out / name, drawn)]
         workbench.print_row(name, *scores, *masked, *(marks or ["", ""]), f"{seconds:.0f}")
 
     show("clean", clean, seconds)
-    for name, moving in (("without", "off"), ("with", "auto")):
+    for name, moving in (("without", "off"), ("with", "auto"), ("ideal", "off")):
+        if only and name not in only:
+            continue
+        trained = made if name != "ideal" else with_ideal_masks(made, drawn, out / "ideal-masks")
         model, seconds, plan = train(
-            made, dataclasses.replace(config, moving=moving), out / name)
+            trained, dataclasses.replace(config, moving=moving), out / name)
         show(name, model, seconds)
         for decision in plan.needs:
             workbench.click.echo(f"{decision.name}: {decision.reason}")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon_cli.evaluation.metrics import corrected_psnr
-from recon_cli.train.feature_trials import LEAST_VIEWS, decide, skip_trial, split
+from recon_cli.train.trial_decisions import LEAST_VIEWS, decide, skip_trial, split
 
 BASE = [20.0, 31.0, 25.0, 28.0, 22.0, 33.0, 27.0, 24.0]
 

@@ -85,6 +85,32 @@ def test_a_shadow_that_touches_a_person_belongs_to_the_region():
     assert find_moving(some)[5][62:68, 60:90].all()
 
 
+def test_a_faint_part_far_from_the_strong_one_is_left():
+    some = views()
+    paint(some[5], slice(20, 60), slice(20, 40), 0.4)
+    paint(some[5], slice(30, 34), slice(40, 130), -0.09)
+    found = find_moving(some)[5]
+    assert found[31:33, 40:54].all()  # a shadow of .12 of the longer side
+    assert not found[:, 64:].any()
+
+
+def test_a_view_that_fits_its_render_is_not_compared():
+    some = views()
+    assert not any(moving.find_suspects(view, 0.004).any() for view in some)
+    paint(some[5], slice(20, 60), slice(60, 80), 0.4)
+    suspects = moving.find_suspects(some[5], 0.004)
+    assert suspects[20:60, 60:80].all()
+    assert suspects.mean() < 0.1
+
+
+@pytest.mark.parametrize(("agreed", "found"), [(12, False), (5, True)])
+def test_where_others_disagree_a_region_is_only_found_once_it_is_likely(agreed, found):
+    amount, spread = np.zeros((H, W), np.float32), np.zeros((H, W), np.float32)
+    amount[20:60, 60:80], spread[20:60, 60:80] = 0.3, 0.03
+    contradiction = moving.Contradiction(amount, spread, np.full((H, W), 8))
+    assert moving.find_regions(contradiction, 0.01, agreed).any() == found
+
+
 def test_what_too_few_others_see_is_not_judged():
     some = views()[:3]
     paint(some[1], slice(20, 60), slice(60, 80), 0.4)

@@ -7,9 +7,9 @@ import pytest
 from wall_scene import CONFIG, scene
 
 from recon_cli.train.feature_trials import examine
-from recon_cli.train.moving_search import enlarge, hide, is_plausible, share_of
+from recon_cli.train.moving_search import are_enough, enlarge, hide, is_plausible, share_of
 
-PARTS = {"far": "off", "stereo": "off", "exposure": "off"}
+PARTS = {"far": "off", "stereo": "off", "exposure": "off", "iterations": 1000}
 
 
 def carried(views, *, size=(50, 26), every=1):
@@ -66,14 +66,37 @@ def test_off_looks_for_nothing_and_on_skips_the_trial():
 
 
 @pytest.mark.integration
-def test_a_clean_wall_gets_no_mask_and_the_reference_recipe_does_not_look():
+def test_a_clean_wall_gets_no_mask():
     needs = examine(scene(config=replace(CONFIG, **PARTS, moving="auto")))
     assert needs.moving is None
-    assert "no views contradict" in decision(needs).reason
+    assert decision(needs).reason == "0 of 26 views contradict the others"
+
+
+@pytest.mark.parametrize("config", [{"densify": "reference"}, {"iterations": 999}])
+def test_the_reference_recipe_and_short_runs_do_not_look(config):
     made = scene()
     views, _ = carried(made.task.train)
-    needs = examine(with_views(made, views, **PARTS, moving="auto", densify="reference"))
+    needs = examine(with_views(made, views, **{**PARTS, "moving": "auto", **config}))
     assert needs.moving is None
+    assert "moving" not in [one.name for one in needs.decisions]
+
+
+@pytest.mark.parametrize(("found", "of", "enough"), [
+    (0, 60, False), (4, 60, False), (5, 60, True), (2, 20, False), (3, 20, True)])
+def test_a_twelfth_of_the_views_must_show_what_moves_and_three_at_least(found, of, enough):
+    assert are_enough(np.arange(of) < found) == enough
+
+
+@pytest.mark.integration
+def test_a_board_in_two_views_is_no_sign():
+    made = scene()
+    views, boards = carried(made.task.train)
+    views = [view if row in (10, 12) else old
+             for row, (view, old) in enumerate(zip(views, made.task.train, strict=True))]
+    assert boards[10].any()
+    needs = examine(with_views(made, views, **PARTS, moving="auto"))
+    assert needs.moving is None
+    assert decision(needs).reason == "2 of 26 views contradict the others"
 
 
 def test_regions_hide_pixels_on_top_of_a_mask():
