@@ -29,29 +29,17 @@ _LEAST_SHARED = 10  # points that two views must both see
 # The first search, at half the size: inverse depths evenly spread, over more than the surface spans
 _HYPOTHESES, _RADIUS = 64, 1
 _NEARER, _FARTHER = 0.7, 1.4
+_COMPARED = 14  # partners at most; what is level or refined is compared with all
 # and along level planes, by their distance from the camera in median depths: in rooms from 65 cm,
 # which a table top lies below a standing person's eyes, to 3 m
 _LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
 # The second one, about what the first found: a window then follows slanted surfaces.
-_FINER, _REFINED_RADIUS = 4, 2
+_REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 _EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
 _TOLERANCE = 0.015  # of a depth, within which another view confirms it
 _FRONTAL = np.zeros(3)  # planes parallel to each image
 _WINDOW, _TEXTURE = 5, 6.0  # pixels a side; deviation of grey levels at which a plane counts 1/e
 _SMALL = 16  # pixels a side
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How many partners each search compares with at most, and depths of the second one."""
-
-    first: int = 14
-    level: int = 20
-    second: int = 20
-    refined: int = 9  # odd: as many before the first search's result as behind it
-
-
-THOROUGH = Effort()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +85,6 @@ class StereoView:
 def find_depths(
     photos: Sequence[StereoView], partners: NDArray[np.int64], near: float,
     on_photo: Callable[[], None] = lambda: None, *, levels: Levels | None = None,
-    effort: Effort = THOROUGH,
 ) -> list[NDArray[np.float32]]:
     """Returns a depth map [H, W] in world units of each photo, 0 where there is none.
 
@@ -107,7 +94,6 @@ def find_depths(
         near: least depth of a surface, world units.
         on_photo: called for each photo twice, with `levels` three times.
         levels: to be searched as well; two fifths more time for more of floors and ceilings.
-        effort: of the searches.
     """
     full = [(photo.grey, photo.view.camera) for photo in photos]
     half = [_halved(*image) for image in full]
@@ -117,21 +103,21 @@ def find_depths(
     steps = (ranges[:, 1] - lowest) / (_HYPOTHESES - 1)
     base = [np.zeros(image.shape, np.float32) for image, _ in half]
     sweeps = [_Sweep(
-        partners[:, :effort.first], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
+        partners[:, :_COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
     if levels:
         first, last = 1 / (_HIGHEST * levels.median), 1 / (_LOWEST * levels.median)
         step = (last - first) / (_LEVELS - 1)
         sweeps.append(_Sweep(
-            partners[:, :effort.level], base, np.full(len(photos), first),
-            np.full(len(photos), step), _LEVELS, _RADIUS, levels.up))
+            partners, base, np.full(len(photos), first), np.full(len(photos), step), _LEVELS,
+            _RADIUS, levels.up))
     coarse = _search(half, sweeps, on_photo)
     coarse = _laid_on_planes(half, coarse, partners, near, steps)
     fine = steps / _FINER
     priors = [_enlarged(found, image.shape)
               for (image, _), found in zip(full, coarse, strict=True)]
     refined = _search(full, [_Sweep(
-        partners[:, :effort.second], priors, -fine * (effort.refined // 2), fine, effort.refined,
-        _REFINED_RADIUS, _FRONTAL)], on_photo)
+        partners, priors, -fine * (_REFINED // 2), fine, _REFINED, _REFINED_RADIUS, _FRONTAL)],
+        on_photo)
     depths = [np.where(prior > 0, _depth(inverse), np.float32(0))
               for prior, inverse in zip(priors, refined, strict=True)]
     masks = [photo.view.mask for photo in photos]
