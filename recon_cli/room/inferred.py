@@ -1,8 +1,9 @@
 """Surface that no view confirms: holes in the large planes of a room, closed where that is certain.
 
 A blank wall gives stereo nothing to match, and its mesh has holes. A hole is closed if it lies in
-a plane of the mesh and surface of this plane, or of another one at their common edge, surrounds it
-on all sides. What a wall has to hide is left open, and what rays crossed: doors, windows, niches.
+a plane of the mesh and surface of this plane, or the line in which it meets another one, lies
+around it on all sides. What a wall has to hide is left open, and what rays crossed: doors, windows,
+niches.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt
+from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt, label
 
 from recon_cli.io.mesh_data import Mesh
 from recon_cli.kernels.thread_pool import pool
@@ -31,6 +32,9 @@ _LEAST_COSINE = 0.8  # between its normal and that of the plane
 _ACROSS = 0.2  # cosine between planes that meet, at most
 _CLOSED = 2  # cells of a gap in what surrounds a hole
 _REACH = 3.0  # cells, from a plane to the surface of another one that meets it
+# Chosen on the room "office", checked on "living" (tests/bench/notes/scenes.md):
+_AROUND = 80  # cells, within which what surrounds a hole lies in each of eight directions
+_MARGIN = 40  # cells around the surface of a plane, to the lines in which it meets others
 _AGREE = 0.05  # of a depth, within which a view shows the plane, not what lies behind it
 _LEAST_AGREE = 2  # views that show it there
 _MOST_CROSSED = 0.25  # share of them and of those whose rays cross it, that may cross it
@@ -122,15 +126,16 @@ def _close(
         return None
     heights = _heights(grid, own)
     confirmed = np.isfinite(heights)
-    meets, beyond = _edges(grid, plane, others)
-    holes = binary_fill_holes(_pad_close(confirmed | meets)) & ~confirmed & ~beyond
+    meets, beyond, lines = _edges(grid, plane, others)
+    around = _pad_close(confirmed | meets)
+    holes = (binary_fill_holes(around) | _is_surrounded(around | lines)) & ~confirmed & ~beyond
     holes &= ~np.isfinite(_heights(grid, near))
     rows, columns = np.nonzero(holes)
     if not len(rows):
         return None
     places = grid.places(rows, columns, np.zeros(len(rows)), 0.5)
     holes[rows, columns] = _is_plane(places, views)
-    holes = _without_specks(holes)
+    holes = _without_specks(_adjoining(holes, confirmed, lines))
     if not holes.any():
         return None
     return _sheet(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
@@ -151,10 +156,10 @@ def _near_faces(plane: Plane, mesh: Mesh, reach: float) -> NDArray[np.int64]:
 
 
 def _grid(plane: Plane, points: NDArray[np.float64], cell: float) -> _Grid | None:
-    """Returns the grid that holds points with a cell to spare, None if it would be huge."""
+    """Returns the grid that holds points with a margin, None if it would be huge."""
     axes = plane_axes(plane.normal)
     flat = points @ axes.T
-    low, high = flat.min(axis=0) - 2 * cell, flat.max(axis=0) + 2 * cell
+    low, high = flat.min(axis=0) - _MARGIN * cell, flat.max(axis=0) + _MARGIN * cell
     low[2] = plane.offset
     columns, rows = (int(side) for side in np.ceil((high - low)[:2] / cell))
     return _Grid(axes, low, cell, (rows, columns)) if rows * columns <= _MOST_CELLS else None
@@ -173,24 +178,55 @@ def _heights(grid: _Grid, corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _edges(
     grid: _Grid, plane: Plane, others: Sequence[tuple[Plane, NDArray[np.float64]]]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns the cells where surface of other planes meets this one, and those behind it."""
-    meets, beyond = np.zeros((2, *grid.shape), bool)
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Returns the cells where surface of other planes meets this one, and those behind it.
+
+    And the lines in which the planes meet, with or without surface.
+    """
+    meets, beyond, lines = np.zeros((3, *grid.shape), bool)
     shift = 0.5 * grid.cell
+    row, column = np.ogrid[:grid.shape[0], :grid.shape[1]]
+    corner = grid.places(np.zeros(1, int), np.zeros(1, int), np.zeros(1), 0.5)
     for other, triangles in others:
         if abs(float(other.normal @ plane.normal)) > _ACROSS:
             continue
+        slope = grid.cell * (grid.axes @ other.normal)
+        lines |= np.abs(other.heights(corner) + slope[0] * column + slope[1] * row) < grid.cell
         local = grid.local(triangles.mean(axis=1))
         local = local[np.abs(local[:, 2]) < _REACH * grid.cell]
-        column, row = np.floor(local[:, :2]).astype(int).T
-        inside = (row >= 0) & (column >= 0) & (row < grid.shape[0]) & (column < grid.shape[1])
+        x, y = np.floor(local[:, :2]).astype(int).T
+        inside = (y >= 0) & (x >= 0) & (y < grid.shape[0]) & (x < grid.shape[1])
         touched = np.zeros(grid.shape, np.uint8)
-        touched[row[inside], column[inside]] = 1
+        touched[y[inside], x[inside]] = 1
         rows, columns = np.nonzero(cv2.dilate(touched, np.ones((5, 5), np.uint8)))
         behind = other.heights(grid.places(rows, columns, np.zeros(len(rows)), 0.5)) < -shift
         meets[rows, columns] = True
         beyond[rows[behind], columns[behind]] = True
-    return meets, beyond
+    return meets, beyond, lines
+
+
+def _is_surrounded(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Returns the cells from which others lie near in each of eight directions."""
+    height, width = cells.shape
+    padded = np.pad(cells, _AROUND)
+    found = np.ones(cells.shape, bool)
+    for down, right in ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)):
+        hit = np.zeros(cells.shape, bool)
+        for step in range(1, round(_AROUND / np.hypot(down, right)) + 1):
+            top, left = _AROUND + step * down, _AROUND + step * right
+            hit |= padded[top:top + height, left:left + width]
+        found &= hit
+    return found
+
+
+def _adjoining(
+    holes: NDArray[np.bool_], confirmed: NDArray[np.bool_], lines: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Returns the holes that reach surface of their plane without crossing a line."""
+    parts, _ = label((holes & ~lines) | confirmed)
+    kept = holes & ~lines & np.isin(parts, np.unique(parts[confirmed]))
+    at_line = cv2.dilate(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return np.asarray(kept | (holes & lines & at_line))
 
 
 def _pad_close(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ from tiny_stages import CONTEXT
 
 from recon_cli.io.mesh_data import Mesh
 from recon_cli.room.depth_maps import weigh
-from recon_cli.room.inferred import infer_surface
+from recon_cli.room.inferred import _is_surrounded, infer_surface
 from recon_cli.room.mesh import mesh_of
 from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.camera import Camera, looking_at
@@ -108,6 +108,37 @@ def test_a_bay_that_another_plane_closes_is_filled_up_to_it():
     assert np.abs(found.vertices[:, 0] - 2.0).max() < 1e-6
     assert found.vertices[:, 2].max() <= HALF + VOXEL + 1e-9
     assert area(found) > 0.8 * 2 * HOLE * (HALF - HOLE)
+
+
+def test_a_bay_is_filled_up_to_the_line_of_a_plane_whose_surface_ends_before_it():
+    bay = wall(lambda y, z: (np.abs(y) < HOLE) & (z > HOLE))
+    x, y = (grid.ravel() for grid in np.meshgrid(
+        2.0 - VOXEL * np.arange(60), np.arange(-HALF, HALF + VOXEL / 2, VOXEL), indexing="ij"))
+    count = len(np.unique(y))
+    row, column = (g.ravel() for g in np.meshgrid(np.arange(59), np.arange(count - 1)))
+    middle = np.abs(y[row * count + column] + VOXEL / 2) < HOLE + 3 * VOXEL
+    a = (row * count + column)[~(middle & (row < 10))]  # it too is open at the bay
+    faces = np.concatenate([np.stack([a, a + 1, a + count], 1),
+                            np.stack([a + 1, a + count + 1, a + count], 1)])
+    normals = np.cross(*(np.array([[0, VOXEL, 0], [-VOXEL, 0, 0]])))
+    faces = faces if normals[2] < 0 else faces[:, ::-1]
+    ceiling = np.stack([x, y, np.full(len(x), HALF)], axis=1)
+    both = Mesh(np.concatenate([bay.vertices, ceiling]),
+                np.concatenate([bay.faces, faces + len(bay.vertices)]),
+                np.zeros((len(bay.vertices) + len(ceiling), 3), np.uint8))
+    found = infer_surface(both, maps_of(blank), VOXEL)
+    in_bay = found.vertices[np.abs(found.vertices[:, 0] - 2.0) < 1e-6]
+    assert in_bay[:, 2].max() <= HALF + 2 * VOXEL + 1e-9
+    assert in_bay[:, 2].max() > HALF - 2 * VOXEL
+    assert np.ptp(in_bay[:, 1]) > 2 * HOLE - VOXEL
+
+
+def test_a_hole_is_surrounded_only_if_something_lies_near_in_all_eight_directions():
+    cells = np.zeros((40, 40), bool)
+    cells[10, 10:31] = cells[30, 10:31] = cells[10:31, 10] = cells[10:31, 30] = True
+    assert _is_surrounded(cells)[11:30, 11:30].all()
+    cells[30] = False  # one side is open
+    assert not _is_surrounded(cells)[11:30, 11:30].any()
 
 
 def test_what_furniture_hides_stays_open():
