@@ -18,11 +18,11 @@ from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
 from recon_cli.train.photometric_evidence import find_photometry
 from recon_cli.train.photometry import Curves, Photometry, Vignettes
-from recon_cli.train.schedule import REFERENCE
 from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.stereo_points import SurfacePoints
 from recon_cli.train.task import Task
 
+_OPACITY = 0.1  # initial opacity of the reference implementation
 _NEIGHBOURS = 3
 _MIN_SCALE = 1e-7  # world units; coincident points would otherwise start at scale 0
 
@@ -34,7 +34,6 @@ def splats_from_points(
     most: int,
     seed: int,
     sh_degree: int,
-    opacity: float = REFERENCE.first_opacity,
 ) -> Splats:
     """Returns one round Gaussian a point, as large as the mean distance to its 3 nearest.
 
@@ -59,7 +58,7 @@ def splats_from_points(
         means=torch.tensor(points, dtype=torch.float32),
         quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
         log_scales=torch.tensor(np.log(scales), dtype=torch.float32)[:, None].repeat(1, 3),
-        logit_opacities=torch.logit(torch.full((n,), opacity)),
+        logit_opacities=torch.logit(torch.full((n,), _OPACITY)),
         sh_dc=(torch.tensor(colors, dtype=torch.float32) / 255 - 0.5) / SH_C0,
         sh_rest=torch.zeros(n, TERMS[sh_degree], 3))
 
@@ -95,8 +94,7 @@ def first_state(
     grey = task.schedule.recipe.backdrop
     centers = np.stack([view.camera.center for view in task.train])
     splats = dataclasses.replace(
-        first_splats(config, points, colors, far, most=most,
-                     opacity=task.schedule.recipe.first_opacity),
+        first_splats(config, points, colors, far, most=most),
         backdrop=Backdrop.behind(grey, centers) if grey else None)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
@@ -167,13 +165,13 @@ def new_photometry(
 
 def first_splats(
     config: RunConfig, points: NDArray[np.float64], colors: NDArray[np.uint8],
-    far: FarContent | None, *, most: int, opacity: float,
+    far: FarContent | None, *, most: int,
 ) -> Splats:
     """Returns the Gaussians before the first step: of the points, and of places far outside."""
     outside = 0 if far is None else len(far.positions)
     near = splats_from_points(
         points, colors, most=max(most // 2, min(most, config.max_gaussians - outside)),
-        seed=config.seed, sh_degree=config.sh_degree, opacity=opacity)
+        seed=config.seed, sh_degree=config.sh_degree)
     if far is None or len(far.positions) == 0:
         return near
     return joined([near, splats_of(far, near.sh_rest.shape[1])])[0]

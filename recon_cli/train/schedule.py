@@ -74,7 +74,6 @@ class Recipe:
     final_rate: float = 1.0  # to which they fall at the end, of their own; exponential
     blur_from: float = 0.6  # share from which blurred views are compared with blurred renders
     backdrop: float = 0.0  # grey level behind all Gaussians, 0 to 1
-    first_opacity: float = 0.1  # of Gaussians at points, before the first step
 
 
 # Kerbl et al. 2023 and INRIA's defaults: 500, 15,000 and 1,000 of 30,000 iterations
@@ -88,7 +87,7 @@ BUDGET = Recipe(
     replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=7.0,
     means_restart_rate=0.7, scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8,
     final_from=0.8, final_rate=0.1,
-    backdrop=0.33, first_opacity=0.4)
+    backdrop=0.33)
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 

@@ -96,15 +96,6 @@ def test_behind_all_gaussians_is_a_grey_backdrop_except_in_the_reference(densify
         assert np.linalg.norm(away) <= backdrop.reach
 
 
-@pytest.mark.parametrize(("densify", "opacity"), [("budget", 0.4), ("reference", 0.1)])
-def test_gaussians_at_points_begin_more_opaque_than_in_the_reference(densify, opacity):
-    config = replace(CONFIG, densify=densify, stereo="on", max_gaussians=1000)
-    surfaces = SurfacePoints(GRID[:3] + 20.0, np.full((3, 3), 200, np.uint8))
-    task = replace(tiny_task(config), stereo=SimpleNamespace(found=surfaces))
-    splats = first_state(task, GRID, GREY, most=100).splats
-    assert splats.opacities.tolist() == pytest.approx([opacity] * 30)
-
-
 def test_a_run_keeps_its_backdrop_from_one_checkpoint_to_the_next(tmp_path):
     task = tiny_task(replace(CONFIG, densify="budget"))
     state = first_state(task, GRID, GREY, most=100)
