@@ -15,14 +15,11 @@ from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.gravity import find_gravity
-from recon_cli.stereo.depths import Effort, Levels, StereoView, find_depths, find_partners, places
+from recon_cli.stereo.depths import Levels, StereoView, find_depths, find_partners, places
 
 _SIDE = 600  # pixels of the longer side at most
 _MOST_VIEWS = 150  # that get a depth map, evenly spread; about 2 CPU seconds each
 _NEIGHBOURS = 20  # views that each is compared with; more of them find more of blank walls
-# Half the time of 14 and 20, for F-scores less by .001 at 5 cm and .004 at 2 cm in one room, and by
-# nothing in another.
-_EFFORT = Effort(first=7, level=10)
 _SAMPLES = 3000  # points looked at to find them
 _LEAST_PIXELS = 20  # with depth, to tell how near and far is searched
 _TAIL = 0.01  # of the pixels, which do not count for that
@@ -51,8 +48,7 @@ def with_stereo(
     up = find_gravity(points, np.stack([camera.viewmat for camera in cameras])).up
     levels = None if up is None else Levels(up, maps.median)
     with progress.bar("stereo", (3 if levels else 2) * len(photos), unit="view") as bar:
-        found = find_depths(
-            photos, partners, maps.near, bar.advance, levels=levels, effort=_EFFORT)
+        found = find_depths(photos, partners, maps.near, bar.advance, levels=levels)
     views = [photo.view for photo in photos]
     rendered, weights = list(maps.depths), [_RENDERED * gain for gain in maps.gains]
     used = []

@@ -29,6 +29,7 @@ _LEAST_SHARED = 10  # points that two views must both see
 # The first search, at half the size: inverse depths evenly spread, over more than the surface spans
 _HYPOTHESES, _RADIUS = 64, 1
 _NEARER, _FARTHER = 0.7, 1.4
+_COMPARED = 14  # partners at most; what is level or refined is compared with all
 # and along level planes, by their distance from the camera in median depths: in rooms from 65 cm,
 # which a table top lies below a standing person's eyes, to 3 m
 _LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
@@ -50,17 +51,6 @@ class Levels:
 
     up: NDArray[np.float64]  # [3] unit vector
     median: float  # depth of all photos, world units
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How many of its partners a photo is compared with where depths are searched coarsely.
-
-    What was found is refined with all of them.
-    """
-
-    first: int = 14
-    level: int = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +85,6 @@ class StereoView:
 def find_depths(
     photos: Sequence[StereoView], partners: NDArray[np.int64], near: float,
     on_photo: Callable[[], None] = lambda: None, *, levels: Levels | None = None,
-    effort: Effort = Effort(),
 ) -> list[NDArray[np.float32]]:
     """Returns a depth map [H, W] in world units of each photo, 0 where there is none.
 
@@ -105,7 +94,6 @@ def find_depths(
         near: least depth of a surface, world units.
         on_photo: called for each photo twice, with `levels` three times.
         levels: to be searched as well; two fifths more time for more of floors and ceilings.
-        effort: of the coarse searches.
     """
     full = [(photo.grey, photo.view.camera) for photo in photos]
     half = [_halved(*image) for image in full]
@@ -115,13 +103,13 @@ def find_depths(
     steps = (ranges[:, 1] - lowest) / (_HYPOTHESES - 1)
     base = [np.zeros(image.shape, np.float32) for image, _ in half]
     sweeps = [_Sweep(
-        partners[:, :effort.first], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
+        partners[:, :_COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
     if levels:
         first, last = 1 / (_HIGHEST * levels.median), 1 / (_LOWEST * levels.median)
         step = (last - first) / (_LEVELS - 1)
         sweeps.append(_Sweep(
-            partners[:, :effort.level], base, np.full(len(photos), first),
-            np.full(len(photos), step), _LEVELS, _RADIUS, levels.up))
+            partners, base, np.full(len(photos), first), np.full(len(photos), step), _LEVELS,
+            _RADIUS, levels.up))
     coarse = _search(half, sweeps, on_photo)
     coarse = _laid_on_planes(half, coarse, partners, near, steps)
     fine = steps / _FINER
