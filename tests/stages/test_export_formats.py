@@ -77,6 +77,7 @@ def test_the_images_of_the_cameras_lie_beside_them(exported, inputs):
         assert image.read_bytes() == original.read_bytes()
 
 
+@pytest.mark.slow
 def test_an_export_that_was_killed_goes_on_over_what_it_left(inputs, tmp_path):
     config = ExportConfig(format=",".join(ASKED))
     export.run(config, inputs, tmp_path, CONTEXT)

@@ -139,8 +139,9 @@ def test_a_run_that_was_killed_while_it_took_the_parts_takes_them_again(mapped, 
 
 
 @pytest.mark.parametrize("lost", [
-    {"changed": frozenset({"parts/2/points3D.bin"})}, {"missing": frozenset({"parts/1/rigs.bin"})},
-    {"changed": frozenset({"steps.json"})}])
+    {"changed": frozenset({"parts/2/points3D.bin"})},
+    *(pytest.param(lost, marks=pytest.mark.slow) for lost in (
+        {"missing": frozenset({"parts/1/rigs.bin"})}, {"changed": frozenset({"steps.json"})}))])
 def test_parts_that_were_changed_are_not_taken(mapped, base, tmp_path, lost):
     out = matched(tmp_path / "out")
     run(base, out, earlier=result_of(mapped, **lost), part=2)  # maps by itself
