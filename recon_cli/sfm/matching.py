@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from recon_cli.errors import FormatError, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, database
 from recon_cli.sfm.database import scales
-from recon_cli.sfm.descriptors import match_descriptors
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
 from recon_cli.sfm.limits import (
     MAX_TRIALS,
@@ -40,7 +38,6 @@ WORD_SAMPLE = 20_000  # descriptors that k-means runs on
 WORD_ROUNDS = 10  # of k-means
 # Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
 EXHAUSTIVE_MAX = 100
-PAIRS_AT_ONCE = 128  # matched, then verified: their descriptors are in memory, 50 MB for 3000 each
 CHUNK = 4096  # descriptors compared with the words at a time, to bound the memory
 
 Pair = tuple[str, str]  # file names in order
@@ -212,35 +209,18 @@ def match_pairs(
     """Matches and verifies image pairs in the database, except those that are there already."""
     wanted, there = set(pairs), database.pair_names(job.database)
     report.phase(phase, len(wanted | there), done=len(there))
-    rest = sorted(wanted - there)
     listed = job.attempts / "pairs.txt"
     job.attempts.mkdir(exist_ok=True)
-    pairing, matching = pycolmap.ImportedPairingOptions(), pycolmap.FeatureMatchingOptions()
-    pairing.match_list_path = listed
-    matching.num_threads = job.threads
-    with _open_for_polling(job) as opened, report.polling(opened.num_verified_image_pairs):
-        for start in range(0, len(rest), PAIRS_AT_ONCE):
-            some = rest[start:start + PAIRS_AT_ONCE]
-            _match_descriptors(job, some)
-            listed.write_text("".join(f"{name} {other}\n" for name, other in some),
-                              encoding="utf-8")
-            # which finds the matches in the database, and verifies them
+    listed.write_text("".join(
+        f"{name} {other}\n" for name, other in sorted(wanted - there)), encoding="utf-8")
+    if wanted - there:
+        pairing, matching = pycolmap.ImportedPairingOptions(), pycolmap.FeatureMatchingOptions()
+        pairing.match_list_path = listed
+        matching.num_threads = job.threads
+        with _open_for_polling(job) as opened, report.polling(opened.num_verified_image_pairs):
             pycolmap.match_image_pairs(
                 job.database, matching, pairing, _verification_options(job), pycolmap.Device.cpu)
-    listed.unlink(missing_ok=True)
-
-
-def _match_descriptors(job: MappingJob, pairs: Sequence[Pair]) -> None:
-    """Writes the matches of pairs into the database, but those that are there."""
-    with pycolmap.Database.open(job.database) as opened, ThreadPoolExecutor(job.threads) as pool:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        numbers = sorted(tuple(sorted((ids[name], ids[other]))) for name, other in pairs)
-        rest = [pair for pair in numbers if not opened.exists_matches(*pair)]
-        descriptors = {number: np.asarray(opened.read_descriptors(number).data, np.uint8)
-                       for number in sorted(set(itertools.chain(*rest)))}
-        found = pool.map(lambda pair: match_descriptors(*(descriptors[i] for i in pair)), rest)
-        for pair, matches in zip(rest, found, strict=True):
-            opened.write_matches(*pair, matches)
+    listed.unlink()
 
 
 def verify_pairs(job: MappingJob, pairs: Iterable[Pair]) -> None:

@@ -161,10 +161,10 @@ def run_job(
 @contextmanager
 def _start(job: MappingJob, file: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Yields the running process and kills it on leaving, however that happens."""
-    # numpy's products are shared out among the threads of the job by pairs of images
+    threads = str(job.threads)
     with (job.out / LOG).open("ab") as log, start_module(
         "recon_cli.sfm.worker", str(file), folder=job.out, out=subprocess.PIPE, errors=log,
-        OMP_NUM_THREADS=str(job.threads), OPENBLAS_NUM_THREADS="1",
+        OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads,
     ) as child:
         try:
             yield child
