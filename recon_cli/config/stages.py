@@ -222,7 +222,7 @@ class TrainConfig(StageConfig):
         "auto", "A gain per image; auto: by trial.",
         choices=("auto", "on", "off"))
     vignette: str = option(
-        "off", "The falloff of each camera's lens towards the corners; auto: by a trial.",
+        "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
         choices=("auto", "on", "off"), late=True, expert=True)
     tone: str = option(
         "off", "A tone curve per image; auto: by a trial.",

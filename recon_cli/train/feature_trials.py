@@ -267,7 +267,9 @@ class _Bench:
     def find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
         """Returns where each training and validation view shows what moves; None: no masks pay."""
         start, task = time.perf_counter(), self._scene.task
-        config = replace(config, blur="off")  # that a view is blurred alike is no contradiction
+        # That a view is blurred alike is no contradiction. Its render is compared as it is, so
+        # corners are as dark in the model as in the photos.
+        config = replace(config, blur="off", vignette="off")
         if split(len(task.train), len(task.validation)) is None:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None

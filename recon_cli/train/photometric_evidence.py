@@ -27,10 +27,10 @@ _LEAST_VIEWS = 3  # that a point needs to say anything
 _ROUNDS = 4  # of weights
 _DOUBT = 1.5  # times the median residual, from which weights fall
 _BEND_PRIOR = 0.2  # standard deviation of a bend before the points are asked
-# From which parts are worth a trial. Measured: corners lose .1 and 1% in two rendered rooms, 4 to
-# 8% in four real captures, 27% in one; bends spread by .03 and .04 in the rooms, by .09 to .43 in
-# six real captures.
-_FALLS, _CURVED = 0.02, 0.08
+# From which parts are worth a trial. Measured: corners lose .1 and 1% in two rendered rooms, 3 to
+# 10% in four real walks, where a vignette is worth -.08 to .16 dB, and 25 to 65% in three others;
+# bends spread by .03 and .04 in the rooms, by .09 to .51 in eight real captures.
+_FALLS, _CURVED = 0.15, 0.08
 
 
 @dataclass(frozen=True, eq=False)

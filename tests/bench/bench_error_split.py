@@ -26,6 +26,7 @@ from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import moving
+from recon_cli.train.photometry import read_falloffs
 
 CAUSES = ("few views", "moving", "pose", "gain", "tone curve", "blur", "rest")
 _FEW = 3  # training views that a pixel needs to be well seen
@@ -161,10 +162,12 @@ def _slopes(image: Image, counts: Mask) -> float:
 def split_workspace(workspace: Path) -> list[Split]:
     """Returns the splits of the held-out views of a workspace by its trained model."""
     config, scene, splats = workbench.open_trained(workspace)
-    degree = config.sh_degree
+    degree, falloffs = config.sh_degree, read_falloffs(workspace / "train")
 
     def draw(camera: Camera) -> tuple[Image, Image]:
         rgb = render_view(splats, camera, degree, "numba").rgb.numpy()
+        if falloffs is not None:
+            rgb = falloffs.shade(rgb, camera)
         depth = render_surface(splats, camera, backend="numba").depth.numpy()
         return rgb.astype(np.float64), depth.astype(np.float64)
 

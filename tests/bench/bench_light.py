@@ -1,22 +1,27 @@
 """What fitting the light of images is worth: gains, vignettes and tone curves, alone or together.
 
-    python tests/bench/bench_light.py WORKSPACE ... --parts "" --parts exposure,tone
+    python tests/bench/bench_light.py WORKSPACE ... --parts "" --parts exposure,tone --parts auto
 
-Each row is a run with the parts on that it names; without any it is the recipe as it is. Held-out
-views are scored as they are, after the best gain of each, and after the mean gain of the training
-views before and after in time, which a run with exposures knows without the held-out view. A fitted
-vignette shades the renders, as `recon eval` does.
+Each row is a run with the parts on that it names; without any it is the recipe as it is, and `auto`
+are those that the trials of `recon train` choose at 600 pixels. Held-out views are scored as they
+are, after the best gain of each, and after the mean gain of the training views before and after in
+time, which a run with exposures knows without the held-out view. A fitted vignette shades the
+renders, as `recon eval` does. The last rows are means over the captures, with the gain over the
+first row. Where photos tell their exposure by EXIF, its column holds the correlation of gains by
+sparse points with it, their slope against it, and what their spread falls to.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import statistics
 import time
 from pathlib import Path
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 from workbench import (
     numba_context,
     open_scene,
@@ -27,11 +32,13 @@ from workbench import (
 )
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.context import StageContext
 from recon_cli.evaluation.metrics import corrected_psnr, psnr
 from recon_cli.evaluation.reference_views import load_reference_views, render_view
 from recon_cli.io.views import ReferenceView
 from recon_cli.scene.scene import Scene
-from recon_cli.train.exposure import estimate_gains
+from recon_cli.train.exposure import Estimate, estimate_gains
+from recon_cli.train.feature_trials import TrialScene, examine
 from recon_cli.train.photometric_evidence import find_photometry
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
@@ -39,6 +46,7 @@ from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task
 
 PARTS = ("exposure", "vignette", "tone")
+TRIAL_SIZE = 600  # pixels; of `recon train` by default
 
 
 def score(
@@ -62,10 +70,31 @@ def score(
     return float(means[0]), float(means[1]), float(means[2]) if len(means) > 2 else None
 
 
+def choose_parts(scene: Scene, config: RunConfig, ctx: StageContext) -> str:
+    """Returns the parts that trials switch on."""
+    options = dataclasses.replace(config, max_size=TRIAL_SIZE, **dict.fromkeys(PARTS, "auto"))
+    task = load_task(scene, options, ctx)
+    chosen = examine(TrialScene(task, scene.points, scene.colors, None)).config
+    return ",".join(part for part in PARTS if getattr(chosen, part) == "on")
+
+
+def compare_exif(drift: Estimate, exposures: NDArray[np.float64] | None) -> str:
+    """Returns correlation and slope of gains by points on those by EXIF, and their spreads."""
+    if exposures is None:
+        return ""
+    known = np.isfinite(exposures)
+    nominal, found = math.log(2) * exposures[known], drift.log_gains[known].mean(axis=1)
+    if known.sum() < 3 or nominal.std() == 0:
+        return ""
+    slope, offset = np.polyfit(nominal, found, 1)
+    rest = (found - slope * nominal - offset).std()
+    return f"{np.corrcoef(nominal, found)[0, 1]:.2f}, {slope:.2f}, {found.std():.3f} to {rest:.3f}"
+
+
 @click.command()
 @workspaces_argument
 @click.option("--parts", "chosen", multiple=True, default=("", "exposure", "vignette", "tone"),
-              show_default=True, help="PART,...: those that are on in a row.")
+              show_default=True, help="PART,... that are on in a row, or auto.")
 @click.option("--seeds", default=1, show_default=True)
 @click.option("--iterations", default=900, show_default=True)
 @click.option("--max-size", default=320, show_default=True)
@@ -74,31 +103,45 @@ def main(workspaces: tuple[Path, ...], chosen: tuple[str, ...], seeds: int, iter
          max_size: int, max_gaussians: int) -> None:
     """Print the held-out PSNR with the parts that take light out of the scene."""
     ctx = numba_context(1)
-    print_head("capture", "drift, place, corner, bends", "parts", "as is", "after best gain",
-               "after neighbours' gain", "CPU s")
+    print_head("capture", "drift, place, corner, bends", "EXIF", "parts", "as is",
+               "after best gain", "after neighbours' gain", "CPU s")
+    scores: dict[str, list[tuple[float, ...]]] = {words: [] for words in chosen}
     for workspace in workspaces:
         scene = open_scene(workspace, 0.0)
         base = RunConfig(
             iterations=iterations, max_size=max_size, max_gaussians=max_gaussians, sh_degree=1,
-            images="original", far="on", stereo="off", early_stop=False)
+            images="original", far="on", stereo="off", blur="off", moving="off", early_stop=False)
         task = load_task(scene, base, ctx)
         drift = estimate_gains(task.train, scene.points)
         light = find_photometry(task.train, scene.points)
         signs = (f"{drift.spread:.3f}, {drift.local:.2f}, {light.corner_loss:.3f}, "
                  f"{light.bend_spread:.3f}")
+        exif = compare_exif(drift, task.exposures)
         views = load_reference_views(scene.test, max_size, ctx)
+        known: dict[str, tuple[float | None, ...]] = {}  # a choice of trials may be a row as well
         for words in chosen:
-            parts = [part for part in words.split(",") if part]
-            found, start = [], time.process_time()
-            for seed in range(seeds):
-                config = dataclasses.replace(base, seed=seed, **{
-                    part: "on" if part in parts else "off" for part in PARTS})  # type: ignore[arg-type]
-                run = dataclasses.replace(task, schedule=Schedule(config))
-                found.append(score(train_model(run, scene), run, scene, views))
-            cells = [f"{statistics.mean(column):.2f}" if None not in column else ""
-                     for column in zip(*found, strict=True)]
-            print_row(workspace.name, signs, words or "none", *cells,
+            start = time.process_time()
+            on = choose_parts(scene, base, ctx) if words == "auto" else words
+            if on not in known:
+                found = []
+                for seed in range(seeds):
+                    config = dataclasses.replace(base, seed=seed, **{
+                        part: "on" if part in on.split(",") else "off" for part in PARTS})
+                    run = dataclasses.replace(task, schedule=Schedule(config))
+                    found.append(score(train_model(run, scene), run, scene, views))
+                known[on] = tuple(None if None in column else statistics.mean(column)
+                                  for column in zip(*found, strict=True))
+            scores[words].append(known[on][:2])
+            name = f"auto: {on or 'none'}" if words == "auto" else words or "none"
+            print_row(workspace.name, signs, exif, name,
+                      *("" if cell is None else f"{cell:.2f}" for cell in known[on]),
                       f"{(time.process_time() - start) / seeds:.0f}")
+    first = np.mean(scores[chosen[0]], axis=0)
+    for words in chosen:
+        means = np.mean(scores[words], axis=0)
+        print_row(f"mean of {len(workspaces)}", "", "", words or "none",
+                  *(f"{mean:.2f} ({mean - before:+.2f})"
+                    for mean, before in zip(means, first, strict=True)), "", "")
 
 
 if __name__ == "__main__":

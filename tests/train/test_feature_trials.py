@@ -40,7 +40,7 @@ def test_a_camera_that_sets_its_exposure_is_found_and_helped():
 
 
 def test_a_lens_with_dark_corners_is_found_and_helped():
-    config = replace(CONFIG, vignette="auto", tone="auto")
+    config = replace(CONFIG, tone="auto")
     needs = examine(scene(vignette=(-0.5, -0.3), config=config))
     decision = next(one for one in needs.decisions if one.name == "vignette")
     assert decision.on, decision.reason
