@@ -27,7 +27,7 @@ from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.mapper import model_size
 
-HEADINGS = ("capture", "mapper", "registered", "models", "reprojection px",
+HEADINGS = ("capture", "mapper", "registered", "models", "points", "reprojection px",
             "centre median / max", "compared with", "CPU s")
 LEAF, OVERLAP = 40, 20  # images of a cluster and of two: COLMAP's 500 would leave a single cluster
 FEWEST = 3  # cameras that can be compared
@@ -78,16 +78,16 @@ def measure(workspace: Path, name: str, truth: Poses) -> tuple[str, ...]:
         try:
             models = sorted(MAPPERS[name](job, Reporter(io.BytesIO())), key=model_size)
         except (RuntimeError, ValueError) as error:
-            return name, "", "", "", f"failed: {error}", "", f"{time.process_time() - start:.1f}"
+            return name, "", "", "", "", f"failed: {error}", f"{time.process_time() - start:.1f}"
         seconds = time.process_time() - start
         if not models:
             return name, "0", "0", "", "", "", f"{seconds:.1f}"
         best = models[-1]
         (out / "best").mkdir()
         best.write_binary(out / "best")
-        return (name, str(best.num_reg_images()), str(len(models)),
-                f"{best.compute_mean_reprojection_error():.2f}",
-                errors(model_poses(out / "best"), truth), "", f"{seconds:.1f}")
+        return (name, str(best.num_reg_images()), str(len(models)), str(best.num_points3D()),
+                f"{best.compute_mean_reprojection_error():.3f}",
+                errors(model_poses(out / "best"), truth), f"{seconds:.1f}")
 
 
 def describe_finished(workspace: Path, truth: Poses | None) -> tuple[str, ...]:
@@ -96,8 +96,8 @@ def describe_finished(workspace: Path, truth: Poses | None) -> tuple[str, ...]:
     way = next((rung["name"] for rung in summary["rungs"] if rung["kept"]), "given poses")
     own = model_poses(workspace / "sfm" / "sparse")
     return (f"recon ({way})", str(summary["registered"]), str(len(summary["models"])),
-            f"{summary['reprojection_error_px']:.2f}", "" if truth is None else errors(own, truth),
-            "", f"{summary['cpu_seconds']['model']:.1f}")
+            str(summary["points"]), f"{summary['reprojection_error_px']:.3f}",
+            "" if truth is None else errors(own, truth), f"{summary['cpu_seconds']['model']:.1f}")
 
 
 @click.command()
@@ -119,7 +119,7 @@ def main(workspaces: tuple[str, ...], names: tuple[str, ...]) -> None:
                       *(measure(workspace, name, truth or own) for name in names)):
             own_row = cells[0].startswith("recon")
             compared = "reference" if given else "" if own_row else "recon"
-            print_row(workspace.name, *cells[:5], compared, cells[6])
+            print_row(workspace.name, *cells[:6], compared, cells[6])
 
 
 if __name__ == "__main__":
