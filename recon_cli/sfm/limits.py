@@ -33,10 +33,6 @@ MIN_DEEP_SHARE = 0.01
 # third off the verification of five captures and lost 8 of 5700 verified pairs, but no image. A
 # similarity that a quarter of the points agree on takes 900.
 MAX_TRIALS = 2000
-# And at least, whatever the inliers found; of COLMAP's 100. Its own rule of confidence asks for 32
-# where nine of ten matches are right. Of 829 pairs of ten captures the same 744 are verified, with
-# .999 to 1.005 of the matches.
-MIN_TRIALS = 30
 
 # --- points and rays
 # Pixels that a point may be off in a model, and a match from its epipolar line

@@ -23,7 +23,6 @@ from recon_cli.sfm.limits import (
     MIN_DEEP_SHARE,
     MIN_PAIR_INLIERS,
     MIN_PANORAMA_SHARE,
-    MIN_TRIALS,
 )
 from recon_cli.sfm.results import MatchesResult
 
@@ -236,7 +235,7 @@ def verify_pairs(job: MappingJob, pairs: Iterable[Pair]) -> None:
 def _verification_options(job: MappingJob) -> pycolmap.TwoViewGeometryOptions:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.seed
-    options.ransac.min_num_trials, options.ransac.max_num_trials = MIN_TRIALS, MAX_TRIALS
+    options.ransac.max_num_trials = MAX_TRIALS
     if job.panoramas and len(job.panoramas) == len(job.names):
         options.min_inlier_ratio = MIN_PANORAMA_SHARE
     return options
