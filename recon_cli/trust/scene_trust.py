@@ -44,7 +44,7 @@ FOLDER = "trust"  # in that of evaluate
 RECORD = "trust.json"
 _AT_ONCE = 16  # training photos in memory
 _CALIBRATION = 12  # views that the errors are calibrated on, at most
-_PIXELS = 50_000  # of each view whose agreement is measured, about: sorting takes most time
+_PIXELS = 25_000  # of each view whose agreement is measured, about: sorting takes most time
 
 
 @dataclass(frozen=True, kw_only=True)
