@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.evaluation.metrics import corrected_psnr, ssim, to_decibels, weighted_error
+from recon_cli.evaluation.metrics import both_ssim, corrected_psnr, to_decibels, weighted_error
 from recon_cli.evaluation.scores import ViewScore
 from recon_cli.io.images import to_uint8
 from recon_cli.io.panoramas import panorama_axes, panorama_size, stitch_faces
@@ -72,8 +72,8 @@ def score_face(
     angle = float(weights.sum())
     similar = padded = corrected = 0.0
     if inner > 0:
-        similar = inner * ssim(image, photo, counts, weights=weights)
-        padded = angle * ssim(image, photo, counts, padded=True, weights=weights)
+        similar, padded = both_ssim(image, photo, counts, weights=weights)
+        similar, padded = inner * similar, angle * padded
         corrected = angle * 10 ** (-corrected_psnr(image, photo, counts) / 10)
     return FaceScore(
         view.face_of, own.whole, angle, inner, weighted_error(image, photo, weights),

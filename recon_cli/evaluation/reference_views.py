@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import statistics
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, ReconstructionError
-from recon_cli.evaluation.metrics import Perceptual, corrected_psnr, psnr, ssim
+from recon_cli.evaluation.metrics import Perceptual, both_ssim, corrected_psnr, psnr, ssim
 from recon_cli.evaluation.panoramas import FaceScore, face_weights, join_faces, score_face
 from recon_cli.evaluation.scores import MeanScore, ViewScore
 from recon_cli.io.images import fit_camera, to_uint8
@@ -39,6 +40,50 @@ class RenderScores:
 
     views: tuple[ViewScore, ...]
     render_ms: float  # median milliseconds a view
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The images of a render, on the CPU."""
+
+    rgb: NDArray[np.float32]  # [H, W, 3] on the backdrop, not clamped
+    alpha: NDArray[np.float32]  # [H, W]
+    depth: NDArray[np.float32]  # [H, W] sum of alpha T z, world units
+
+    @staticmethod
+    def from_output(output: RenderOutput) -> Images:
+        """Returns those of a backend's output; waits for them."""
+        return Images(*(np.asarray(tensor.cpu().numpy(), np.float32)
+                        for tensor in (output.rgb, output.alpha, output.depth)))
+
+
+class RenderedModel:
+    """A model, and images of it that need not be rendered again, by camera."""
+
+    def __init__(self, splats: Splats, sh_degree: int, backend: str, room: int = 0) -> None:
+        self.splats, self.sh_degree, self.backend = splats, sh_degree, backend
+        self._room = room  # bytes that are left for images
+        self._kept: dict[bytes, Images] = {}
+        self._lock = threading.Lock()
+
+    def keep(self, camera: Camera, images: Images) -> None:
+        """Keeps what a camera sees if there is room for it."""
+        size = images.rgb.nbytes + images.alpha.nbytes + images.depth.nbytes
+        with self._lock:
+            if size <= self._room and _key(camera) not in self._kept:
+                self._kept[_key(camera)] = images
+                self._room -= size
+
+    def images(self, camera: Camera) -> Images:
+        """Returns what a camera sees, rendered unless it was kept."""
+        kept = self._kept.get(_key(camera))
+        return kept or Images.from_output(
+            render_view(self.splats, camera, self.sh_degree, self.backend))
+
+
+def _key(camera: Camera) -> bytes:
+    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return np.array(lens, np.float64).tobytes() + camera.viewmat.tobytes()
 
 
 def load_reference_views(
@@ -92,7 +137,7 @@ def score_image(
     """
     return ViewScore(
         name, psnr(image, truth, mask), psnr(to_uint8(image), truth, mask),
-        ssim(image, truth, mask), ssim(image, truth, mask, padded=True),
+        *both_ssim(image, truth, mask),
         perceptual(image, truth) if perceptual is not None and mask is None else None,
         None if mask is None else float(mask.mean()))
 
@@ -101,26 +146,27 @@ def score_views(
     splats: Splats, views: Sequence[ReferenceView], sh_degree: int, backend: str,
     *, perceptual: Perceptual | None = None, threads: int = 1,
     falloffs: LensFalloffs | None = None,
-    on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _image: None,
+    on_view: Callable[[ReferenceView, Images], None] = lambda _view, _images: None,
 ) -> RenderScores:
     """Renders every view, at least one, of a model and returns its scores.
 
     The faces of a panorama are scored together, under the name of their frame. `perceptual` is
-    LPIPS; `falloffs` shade the renders; `on_view` gets each view and its render [H, W, 3], not
-    clamped, in one of `threads`.
+    LPIPS; `falloffs` shade the renders; `on_view` gets each view and its images in one of
+    `threads`.
     """
     weights = face_weights(views)
 
     def score(
-        view: ReferenceView, image: NDArray[np.float32]
+        view: ReferenceView, images: Images
     ) -> tuple[ViewScore, float] | FaceScore:
+        image = images.rgb
         if view.name in weights:
             face = score_face(view, image, weights[view.name])
-            on_view(view, image)
+            on_view(view, images)
             return face
         photo, mask = view.image, view.mask
         scores = score_image(view.name, image, photo, mask, perceptual=perceptual)
-        on_view(view, image)
+        on_view(view, images)
         return scores, corrected_psnr(image, photo, mask)
 
     milliseconds: list[float] = []
@@ -136,14 +182,14 @@ def score_views(
 def mean_psnr(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str,
     *, corrected: bool = False, threads: int = 1, falloffs: LensFalloffs | None = None,
-    on_view: Callable[[], None] = lambda: None,
+    on_view: Callable[[TrainView, Images], None] = lambda _view, _images: None,
 ) -> float:
-    """Returns the mean PSNR in dB over views, at least one; `on_view` is called in `threads`."""
+    """Returns the mean PSNR in dB over views, at least one; arguments are as of `score_views`."""
     metric = corrected_psnr if corrected else psnr
 
-    def score(view: TrainView, image: NDArray[np.float32]) -> float:
-        value = metric(image, view.image, view.mask)
-        on_view()
+    def score(view: TrainView, images: Images) -> float:
+        value = metric(images.rgb, view.image, view.mask)
+        on_view(view, images)
         return value
 
     return statistics.fmean(_measure(
@@ -154,17 +200,17 @@ def mean_score(
     splats: Splats, views: Sequence[TrainView], sh_degree: int, backend: str
 ) -> MeanScore:
     """Returns the mean PSNR and SSIM over views, at least one."""
-    mean = np.mean(_measure(splats, views, sh_degree, backend, lambda view, image: (
-        psnr(image, view.image, view.mask), ssim(image, view.image, view.mask))), axis=0)
+    mean = np.mean(_measure(splats, views, sh_degree, backend, lambda view, images: (
+        psnr(images.rgb, view.image, view.mask), ssim(images.rgb, view.image, view.mask))), axis=0)
     return MeanScore(float(mean[0]), float(mean[1]))
 
 
 def _measure(
     splats: Splats, views: Sequence[_View], sh_degree: int, backend: str,
-    score: Callable[[_View, NDArray[np.float32]], _Item], *, threads: int = 1,
+    score: Callable[[_View, Images], _Item], *, threads: int = 1,
     milliseconds: list[float] | None = None, falloffs: LensFalloffs | None = None,
 ) -> list[_Item]:
-    """Returns the `score` of each view and its render [H, W, 3].
+    """Returns the `score` of each view and its images, the render as `falloffs` shade it.
 
     Scores of some views are taken at once, as most of them keep to one core; meanwhile nothing is
     rendered, so that `milliseconds`, to which the times of the renders are added, mean something.
@@ -172,15 +218,17 @@ def _measure(
     results: list[_Item] = []
     with ThreadPoolExecutor(threads) as pool:
         for begin in range(0, len(views), _AT_ONCE * threads):
-            group, images = views[begin:begin + _AT_ONCE * threads], []
+            group, rendered = views[begin:begin + _AT_ONCE * threads], []
             for view in group:
                 start = time.perf_counter()
                 output = render_view(splats, view.camera, sh_degree, backend)
-                image = np.asarray(output.rgb.cpu().numpy(), np.float32)  # waits for it
-                images.append(image if falloffs is None else falloffs.shade(image, view.camera))
+                images = Images.from_output(output)
+                if falloffs is not None:
+                    images = replace(images, rgb=falloffs.shade(images.rgb, view.camera))
+                rendered.append(images)
                 if milliseconds is not None:
                     milliseconds.append(1e3 * (time.perf_counter() - start))
-            results += pool.map(score, group, images)
+            results += pool.map(score, group, rendered)
     return results
 
 

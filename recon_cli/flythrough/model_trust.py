@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 from recon_cli.context import StageContext
+from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.flythrough.trained_scene import TrainedScene
 from recon_cli.pipeline.execute import Job
 from recon_cli.train.train_data import read_config
@@ -28,6 +29,8 @@ def load_trust(job: Job, trained: TrainedScene, ctx: StageContext) -> Trust:
     if trust is None:
         logger.info("trust is measured on the training views now; `recon eval` keeps it")
         with ctx.progress.bar("trust", views_looked_at(trained.scene), unit="view") as bar:
-            trust = measure_trust(splats, trained.scene, read_config(folder("train")),
-                                  trained.max_size, ctx, bar.advance)
+            config = read_config(folder("train"))
+            trust = measure_trust(
+                RenderedModel(splats, config.sh_degree, ctx.backend), trained.scene, config,
+                trained.max_size, ctx, bar.advance)
     return Trust(trust.support.to(splats.means.device), trust.error, trust.sh_degree)

@@ -34,6 +34,8 @@ from recon_cli.evaluation.metrics import (
 )
 from recon_cli.evaluation.panoramas import PanoramaPictures
 from recon_cli.evaluation.reference_views import (
+    Images,
+    RenderedModel,
     load_held_out_views,
     load_reference_views,
     mean_psnr,
@@ -53,7 +55,7 @@ from recon_cli.io.images import to_uint8, write_png
 from recon_cli.io.training_scene import load_scene
 from recon_cli.io.views import ReferenceView, evenly_spread, size_summary, sizes_of
 from recon_cli.scene.scene import Scene
-from recon_cli.scene.train_view import leaves_enough
+from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
 from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_masks import read_summary, with_masks
@@ -70,6 +72,7 @@ _GAIN = 4  # of the difference images
 _ANY_ITERATION = 1 << 62  # beyond the last
 _SEEN_VIEWS = 20  # training and validation views that are also scored, at most
 _STAGES = {"base": "train", "pruned": "prune"}  # by model
+_ROOM = 512 << 20  # bytes of images that trust need not render again: 130 views of 600x340
 _STRETCHES = 5  # of frames that are left out, in the tables
 
 
@@ -95,37 +98,48 @@ class _Evaluation:
         """Whether training had a gain for each view."""
         return self.config.exposure == "on"
 
+    def open(self, model: str, *, room: int) -> RenderedModel:
+        """Reads one model; it keeps so many bytes of images that `score` renders."""
+        splats = read_ply(self.folders[model] / "splats.ply")
+        return RenderedModel(splats.map(lambda tensor: tensor.to(self.ctx.device)),
+                             self.config.sh_degree, self.ctx.backend, room)
+
     def score(
-        self, model: str, perceptual: Perceptual | None, on_view: Callable[[], None]
+        self, model: str, rendered: RenderedModel, perceptual: Perceptual | None,
+        on_view: Callable[[], None],
     ) -> ModelMetrics:
         """Renders and scores one model, and saves its pictures."""
-        path, backend = self.folders[model] / "splats.ply", self.ctx.backend
-        threads = self.ctx.threads
-        splats = read_ply(path).map(lambda tensor: tensor.to(self.ctx.device))
-        degree, falloffs = self.config.sh_degree, read_falloffs(self.folders[model])
+        splats, degree, backend = rendered.splats, rendered.sh_degree, rendered.backend
+        threads, falloffs = self.ctx.threads, read_falloffs(self.folders[model])
+
+        def seen(view: TrainView, images: Images) -> None:
+            if falloffs is None:  # trust is that of the scene, without a lens
+                rendered.keep(view.camera, images)
+            on_view()
 
         pictures = PanoramaPictures(self.held_out)
 
         static: list[float] = []
 
-        def save(view: ReferenceView, image: NDArray[np.float32]) -> None:
+        def save(view: ReferenceView, images: Images) -> None:
             if self.moving:
-                static.append(psnr(image, view.image, self._static(view)))
-            for name, rendered, photo, mask in pictures.take(view, image):
-                _save_pictures(self.out, model, name, rendered, photo, mask)
-            on_view()
+                static.append(psnr(images.rgb, view.image, self._static(view)))
+            for name, image, photo, mask in pictures.take(view, images.rgb):
+                _save_pictures(self.out, model, name, image, photo, mask)
+            seen(view, images)
 
         scores = score_views(
             splats, self.held_out, degree, backend, perceptual=perceptual, threads=threads,
             falloffs=falloffs, on_view=save)
         seen_db = {
             name: mean_psnr(splats, views, degree, backend, corrected=self.gains, threads=threads,
-                            falloffs=falloffs, on_view=on_view)
+                            falloffs=falloffs, on_view=seen)
             for name, views in self.training_views.items()}
         log = self.folders[model] / LOG
         seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
         return ModelMetrics.from_views(
-            scores.views, gaussians=len(splats), bytes=path.stat().st_size,
+            scores.views, gaussians=len(splats),
+            bytes=(self.folders[model] / "splats.ply").stat().st_size,
             render_ms=scores.render_ms, train_seconds=seconds,
             seen_after_gains=self.gains, seen_psnr_db=seen_db,
             static_psnr_db=float(np.mean(static)) if static else None)
@@ -189,9 +203,11 @@ def run(
             _save(out / "truth" / f"{Path(name).stem}.png", photo)
     perceptual, lacking = load_lpips()
     views = len(evaluation.held_out) + sum(map(len, evaluation.training_views.values()))
+    models: dict[str, ModelMetrics] = {}
     with ctx.progress.bar("evaluate", len(evaluation.folders) * views, unit="view") as bar:
-        models = {model: evaluation.score(model, perceptual, bar.advance)
-                  for model in evaluation.folders}
+        for name in evaluation.folders:  # the last one is exported: the pruned one if there is one
+            rendered = evaluation.open(name, room=_ROOM if config.trust else 0)
+            models[name] = evaluation.score(name, rendered, perceptual, bar.advance)
     unregistered = evaluation.scene.unregistered_test
     if unregistered:
         ctx.notice(f"{len(unregistered)} held-out views have no camera and are not scored: "
@@ -205,9 +221,8 @@ def run(
             means[f"{name}_{key}"] = round(getattr(model, key), 4)
         if evaluation.gains and model.gain_psnr_db is not None:
             means[f"{name}_gain_psnr_db"] = round(model.gain_psnr_db, 4)
-    exported, folder = list(evaluation.folders.items())[-1]  # the pruned model, if there is one
     trust = assess(TrustTask(
-        exported, folder, evaluation.config, evaluation.scene, evaluation.held_out,
+        name, rendered, evaluation.config, evaluation.scene, evaluation.held_out,
         config.max_size or evaluation.config.max_size, evaluation.import_record,
         WorldSummary.read(inputs.folders["sfm"])), out, ctx) if config.trust else None
     return EvaluateSummary(**means, poorly_seen=tuple(trust.lines()) if trust else None)

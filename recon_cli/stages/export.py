@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconError, ReconstructionError, StageError, WorkspaceError
+from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.export.bounds import describe_bounds
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
 from recon_cli.export.format_writer import FormatWriter, measure_first
@@ -158,8 +159,8 @@ def _expected_errors(
     scene = load_scene(inputs.folders, validation=run_config.validation)
     with ctx.progress.bar("trust", views_looked_at(scene), unit="view") as bar:
         errors = expected_errors(trained, measure_trust(
-            trained.map(lambda tensor: tensor.to(ctx.device)), scene, run_config,
-            run_config.max_size, ctx, bar.advance))
+            RenderedModel(trained.map(lambda tensor: tensor.to(ctx.device)), run_config.sh_degree,
+                          ctx.backend), scene, run_config, run_config.max_size, ctx, bar.advance))
     rows = match_rows(splats.means, frame.similarity.points(trained.means.double().numpy()))
     return {PLY_PROPERTY: errors[rows]}
 

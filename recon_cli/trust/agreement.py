@@ -32,9 +32,10 @@ def sparsification(errors: Array, order: Array) -> Array:
     return np.asarray(left / max(float(errors.mean()), 1e-12))
 
 
-def ause(errors: Array, order: Array) -> float:
-    """Returns the area between the curve of `order` and the oracle's, both [P]."""
-    return float((sparsification(errors, order) - sparsification(errors, errors)).mean())
+def ause(errors: Array, *orders: Array) -> tuple[float, ...]:
+    """Returns the areas between the curve of each of `orders` and the oracle's; all are [P]."""
+    oracle = sparsification(errors, errors)
+    return tuple(float((sparsification(errors, order) - oracle).mean()) for order in orders)
 
 
 @dataclass(frozen=True)

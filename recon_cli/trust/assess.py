@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
+from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.io.images import write_png
 from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
-from recon_cli.splats.ply import read_ply
 from recon_cli.trust.heat_map import heat_colors
 from recon_cli.trust.poorly_seen import find_poorly_seen
 from recon_cli.trust.scene_trust import (
@@ -36,7 +36,7 @@ class TrustTask:
     """The models to assess, and the views."""
 
     model: str  # base, or pruned where that is what export takes
-    folder: Path  # of its stage
+    rendered: RenderedModel  # the same, with images that scoring rendered
     config: RunConfig  # of the training
     scene: Scene
     held_out: Sequence[ReferenceView]
@@ -56,13 +56,14 @@ def assess(task: TrustTask, out: Path, ctx: StageContext) -> TrustRecord:
         return record
     views = views_looked_at(task.scene) + len(task.held_out)
     with ctx.progress.bar("trust", views, unit="view") as bar:
-        splats = read_ply(task.folder / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
-        trust = measure_trust(splats, task.scene, task.config, task.max_size, ctx, bar.advance)
+        trust = measure_trust(
+            task.rendered, task.scene, task.config, task.max_size, ctx, bar.advance)
         trust.save(out, task.model)
-        cells = find_cells(splats, trust.support)
+        cells = find_cells(task.rendered.splats, trust.support)
         assessed = model_trust(
-            trust, splats, surface_shares(cells), task.held_out, gains=task.config.exposure == "on",
-            backend=ctx.backend, on_view=_saver(out / FOLDER / task.model, bar.advance))
+            trust, task.rendered, surface_shares(cells), task.held_out,
+            gains=task.config.exposure == "on",
+            on_view=_saver(out / FOLDER / task.model, bar.advance))
     frames = [view.name for view in evenly_spread(task.scene.train, MAX_VIEWS)]
     record = TrustRecord(
         models=(task.model,), base=assessed if task.model == "base" else None,

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.render import render
 from recon_cli.render.torch.projection import colors_from_sh
 from recon_cli.scene.camera import Camera
@@ -98,28 +99,27 @@ class Picture:
     terms: Mapping[str, NDArray[np.float32]]  # [H, W] by the names of TERMS
 
 
-def picture_terms(
-    splats: Splats, support: Support, camera: Camera, *, sh_degree: int, backend: str
-) -> Picture:
-    """Renders a view and the terms of its pixels, by two more passes with values for colours."""
+def picture_terms(model: RenderedModel, support: Support, camera: Camera) -> Picture:
+    """Returns a view and the terms of its pixels, by two more passes with values for colours."""
+    splats, backend = model.splats, model.backend
     device, dtype = splats.means.device, splats.means.dtype
+    images = model.images(camera)
     with torch.no_grad():
-        output = render(splats, camera, splats.background, sh_degree, backend=backend)
         sight = support.seen_from(splats.means, camera.center)
         few = 1 / (1 + support.count.to(dtype))
         first = paint(splats, camera, [few, sight.angle, support.residual], backend)
         rotation = torch.as_tensor(camera.viewmat[2], dtype=dtype, device=device)
         depth = (splats.means @ rotation[:3] + rotation[3]).clamp_min(0)
         scale = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
-        bright = _brightness(splats, camera, sh_degree)
+        bright = _brightness(splats, camera, model.sh_degree)
         second = paint(splats, camera, [(depth / scale).square(), sight.nearer, bright.square()],
                        backend)
-    rgb, alpha = output.rgb.cpu().numpy(), output.alpha.cpu().numpy()
+    rgb, alpha = images.rgb, images.alpha
     covered = alpha >= _COVERED
     share = np.where(covered, alpha, 1)
-    mean_depth = output.depth.cpu().numpy() / share / scale
+    mean_depth = images.depth / share / scale
     behind = float(splats.background.mean())
-    gray = (rgb.mean(-1) - (1 - alpha) * behind) / share  # of the Gaussians alone
+    gray = (_gray(rgb) - (1 - alpha) * behind) / share  # of the Gaussians alone
     few_map, angle, residual = (np.where(covered, channel / share, empty) for channel, empty in zip(
         np.moveaxis(first, -1, 0), (1.0, np.pi, float(support.residual.max())), strict=True))
     square, nearer, brightness = (
@@ -159,17 +159,21 @@ def _brightness(splats: Splats, camera: Camera, sh_degree: int) -> torch.Tensor:
     return colors.mean(1)
 
 
+def _gray(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns the mean of the channels, [H, W]; `mean` takes three times as long."""
+    return np.asarray((rgb[..., 0] + rgb[..., 1] + rgb[..., 2]) / 3, np.float32)
+
+
 def _edges(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns the logarithm of the gradient of the brightness, [H, W]."""
-    gray = rgb.clip(0, 1).mean(-1)
+    gray = _gray(rgb.clip(0, 1))
     across, down = (cv2.Sobel(gray, cv2.CV_32F, *order, ksize=3) / 8 for order in ((1, 0), (0, 1)))
     return np.asarray(np.log(np.hypot(across, down) + _EDGE), np.float32)
 
 
 def calibrate(
-    splats: Splats, support: Support, validation: Sequence[TrainView],
-    train: Sequence[TrainView], *, sh_degree: int, backend: str, gains: bool = False,
-    on_view: Callable[[], None] = lambda: None,
+    rendered: RenderedModel, support: Support, validation: Sequence[TrainView],
+    train: Sequence[TrainView], *, gains: bool = False, on_view: Callable[[], None] = lambda: None,
 ) -> ErrorModel:
     """Returns the model fitted to the validation views, which no gradient came from.
 
@@ -179,7 +183,7 @@ def calibrate(
     columns: dict[str, list[Array]] = {name: [] for name in TERMS}
     errors: list[Array] = []
     for view in views:
-        picture = picture_terms(splats, support, view.camera, sh_degree=sh_degree, backend=backend)
+        picture = picture_terms(rendered, support, view.camera)
         error, counts = error_image(picture.rgb, view, gains=gains)
         used = counts > 0
         errors.append(np.asarray(error[used], np.float64))

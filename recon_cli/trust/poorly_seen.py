@@ -98,8 +98,9 @@ def _describe_region(
     few = bool(cells.few[region].sum() >= cells.narrow[region].sum())
     several, wide = cells.views >= MIN_VIEWS, cells.span_deg >= MIN_SPAN_DEG
     poor = np.isin(cells.cell, region) & (~several if few else several & ~wide)
-    rows = cells.rows[torch.from_numpy(poor).to(cells.rows.device)]
-    shown = [int(torch.isin(rows, view).sum()) for view in support.rows]
+    inside = torch.zeros_like(support.count, dtype=torch.bool)
+    inside[cells.rows[torch.from_numpy(poor).to(cells.rows.device)]] = True
+    shown = [int(inside[view].sum()) for view in support.rows]
     return PoorlySeenRegion(
         position=tuple(round(float(value), 4) for value in middle),
         size=round(float((np.ptp(cells.grid[region], axis=0).max() + 1) * cells.size), 4),

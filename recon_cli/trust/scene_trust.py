@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ManifestError, StageError
-from recon_cli.evaluation.reference_views import load_reference_views
+from recon_cli.evaluation.reference_views import RenderedModel, load_reference_views
 from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
@@ -22,8 +22,19 @@ from recon_cli.scene.splats import Splats
 from recon_cli.trust.agreement import ause, reliability
 from recon_cli.trust.error_model import ErrorModel, calibrate, picture_terms
 from recon_cli.trust.heat_map import FULL
+from recon_cli.trust.neighbors import (
+    pose_distances,
+    rendered_count,
+    spread_views,
+    support_of_all,
+)
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
-from recon_cli.trust.support import MAX_VIEWS, Support, error_image, measure_support
+from recon_cli.trust.support import (
+    MAX_VIEWS,
+    Support,
+    error_image,
+    measure_support,
+)
 from recon_cli.trust.surface import SurfaceShares
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord
@@ -33,7 +44,7 @@ FOLDER = "trust"  # in that of evaluate
 RECORD = "trust.json"
 _AT_ONCE = 16  # training photos in memory
 _CALIBRATION = 12  # views that the errors are calibrated on, at most
-_PIXELS = 50_000  # of each view whose agreement is measured, about: sorting takes most time
+_PIXELS = 25_000  # of each view whose agreement is measured, about: sorting takes most time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +123,7 @@ class Trust:
     ) -> NDArray[np.float32]:
         """Returns the expected absolute error of a view's pixels, [H, W] of 0 to 1."""
         picture = picture_terms(
-            splats, self.support, camera, sh_degree=self.sh_degree, backend=backend)
+            RenderedModel(splats, self.sh_degree, backend), self.support, camera)
         return self.error.expect(picture.terms)
 
     def describe_pictures(self) -> dict[str, Any]:
@@ -168,12 +179,12 @@ def refuse_without(record: ImportRecord | None) -> None:
 def views_looked_at(scene: Scene) -> int:
     """Returns how many views `measure_trust` renders."""
     calibration = scene.validation or scene.train
-    return len(evenly_spread(scene.train, MAX_VIEWS)) + len(
+    return rendered_count(len(evenly_spread(scene.train, MAX_VIEWS))) + len(
         evenly_spread(calibration, _CALIBRATION))
 
 
 def measure_trust(
-    splats: Splats, scene: Scene, config: RunConfig, max_size: int, ctx: StageContext,
+    model: RenderedModel, scene: Scene, config: RunConfig, max_size: int, ctx: StageContext,
     on_view: Callable[[], None] = lambda: None,
 ) -> Trust:
     """Returns the trust of a model: a pass over training views, then the validation views.
@@ -181,17 +192,28 @@ def measure_trust(
     `max_size` is the longest side in pixels at which errors are compared.
     """
     gains = config.exposure == "on"
+    every = evenly_spread(scene.train, MAX_VIEWS)
+    cameras = [view.camera for view in every]
+    apart = pose_distances(cameras, model.splats)
+    chosen = [every[number] for number in spread_views(apart, rendered_count(len(every)))]
+    names: list[str] = []  # of those that were rendered: masks may leave too little of some
+
+    def photos() -> Iterator[ReferenceView]:
+        for view in _in_turn(chosen, max_size, ctx.threads):
+            names.append(view.name)
+            yield view
+
     support = measure_support(
-        splats, _in_turn(evenly_spread(scene.train, MAX_VIEWS), max_size, ctx.threads),
-        sh_degree=config.sh_degree, backend=ctx.backend, gains=gains, on_view=on_view,
-        digest=digest_of(splats))
+        model.splats, photos(), sh_degree=model.sh_degree, backend=model.backend, gains=gains,
+        on_view=on_view, digest=digest_of(model.splats))
+    numbers = {view.name: number for number, view in enumerate(every)}
+    rendered = [numbers[name] for name in names]
+    support = support_of_all(support, model.splats, cameras, apart, rendered)
     validation = load_reference_views(evenly_spread(scene.validation, _CALIBRATION), max_size)
     train = [] if validation else load_reference_views(
         evenly_spread(scene.train, _CALIBRATION), max_size)
-    error = calibrate(
-        splats, support, validation, train, sh_degree=config.sh_degree, backend=ctx.backend,
-        gains=gains, on_view=on_view)
-    return Trust(support, error, config.sh_degree)
+    error = calibrate(model, support, validation, train, gains=gains, on_view=on_view)
+    return Trust(support, error, model.sh_degree)
 
 
 def _in_turn(views: Sequence[View], max_size: int, threads: int) -> Iterator[ReferenceView]:
@@ -201,8 +223,8 @@ def _in_turn(views: Sequence[View], max_size: int, threads: int) -> Iterator[Ref
 
 
 def model_trust(
-    trust: Trust, splats: Splats, surface: SurfaceShares, views: Sequence[ReferenceView], *,
-    gains: bool, backend: str,
+    trust: Trust, model: RenderedModel, surface: SurfaceShares, views: Sequence[ReferenceView], *,
+    gains: bool,
     on_view: Callable[[ReferenceView, NDArray[np.float32]], None] = lambda _view, _error: None,
 ) -> ModelTrust:
     """Returns the record of a model's trust, checked on views that did not calibrate it.
@@ -212,17 +234,16 @@ def model_trust(
     areas: list[tuple[float, ...]] = []
     actual_error, expected_error = [], []
     for view in views:
-        picture = picture_terms(
-            splats, trust.support, view.camera, sh_degree=trust.sh_degree, backend=backend)
+        picture = picture_terms(model, trust.support, view.camera)
         expected = trust.error.expect(picture.terms)
         on_view(view, expected)
         error, counts = error_image(picture.rgb, view, gains=gains)
         used = counts > 0
         pixels = slice(None, None, max(1, int(used.sum()) // _PIXELS))
-        errors, own = (np.asarray(image[used][pixels], np.float64) for image in (error, expected))
-        areas.append((ause(errors, own), *(
-            ause(errors, np.asarray(image[used][pixels], np.float64))
-            for image in (1 - picture.alpha, picture.depth))))
+        errors, own, *others = (
+            np.asarray(image[used][pixels], np.float64)
+            for image in (error, expected, 1 - picture.alpha, picture.depth))
+        areas.append(ause(errors, own, *others))
         actual_error.append(errors)
         expected_error.append(own)
     agreement = None

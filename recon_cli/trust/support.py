@@ -1,13 +1,13 @@
 """The support of each Gaussian: the training views that show it, from where, and how well.
 
-One forward pass over the training views; held-out and validation views take no part.
+One forward pass over training views; held-out and validation views take no part.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -41,6 +41,39 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
+class _Rays:
+    """The P rays from views to the Gaussians that they show, Gaussian by Gaussian."""
+
+    means: Tensor  # [N, 3] that they lead to
+    lengths: Tensor  # [N] int64, rays of each
+    directions: Tensor  # [P, 3]
+    nearest: Tensor  # [N] distance of the nearest view; infinite where none shows it
+
+    @staticmethod
+    def from_rows(
+        rows: Sequence[Tensor], centers: NDArray[np.float64], count: Tensor, means: Tensor
+    ) -> _Rays:
+        """Returns the rays from views at `centers` to the Gaussians at `rows` of each."""
+        every = [means.new_zeros(0, dtype=torch.int64), *rows]
+        order = torch.argsort(torch.cat(every), stable=True)
+        parts = [_directions(means[own], center) for own, center in zip(rows, centers, strict=True)]
+        directions = torch.cat([means.new_zeros(0, 3), *(ray for ray, _ in parts)])[order]
+        distances = torch.cat([means.new_zeros(0), *(apart for _, apart in parts)])[order]
+        rays = _Rays(means, count, directions, count)
+        return replace(rays, nearest=rays.reduce("min", distances))
+
+    def reduce(self, how: str, values: Tensor) -> Tensor:
+        """Returns sum, min or max of the values [P, ...] of each Gaussian's rays, [N, ...]."""
+        initial = 0 if how == "sum" else None
+        return torch.segment_reduce(values, how, lengths=self.lengths, unsafe=True, initial=initial)
+
+    def cosines(self, directions: Tensor) -> Tensor:
+        """Returns the cosines [P] of the rays to the direction of their Gaussian, of [N, 3]."""
+        own = directions.repeat_interleave(self.lengths, dim=0)
+        return torch.einsum("pi,pi->p", self.directions, own)
+
+
+@dataclass(frozen=True, eq=False)
 class Support:
     """The support of N Gaussians in the training views."""
 
@@ -49,6 +82,7 @@ class Support:
     residual: Tensor  # [N] mean absolute error of its pixels, 0 to 1, by weight; mean where unseen
     count: Tensor  # [N] int64, number of views that show each
     digest: str = ""  # of the Gaussians
+    _kept: dict[str, _Rays] = field(default_factory=dict, init=False, repr=False)
 
     @staticmethod
     def from_rows(
@@ -70,28 +104,26 @@ class Support:
 
         Twice the greatest angle to their mean direction; 0 for fewer than two views.
         """
-        total = torch.zeros_like(means)
-        for rows, center in zip(self.rows, self.centers, strict=True):
-            total[rows] += _directions(means[rows], center)[0]
-        middle = torch.nn.functional.normalize(total, dim=1)
-        cosine = torch.ones_like(self.residual)
-        for rows, center in zip(self.rows, self.centers, strict=True):
-            own = (_directions(means[rows], center)[0] * middle[rows]).sum(1)
-            cosine[rows] = torch.minimum(cosine[rows], own)
+        rays = self._rays(means)
+        middle = torch.nn.functional.normalize(rays.reduce("sum", rays.directions), dim=1)
+        cosine = rays.reduce("min", rays.cosines(middle))
         return 2 * torch.arccos(cosine.clamp(-1, 1)) * (self.count > 1)
 
     def seen_from(self, means: Tensor, place: NDArray[np.float64]) -> Sight:
         """Returns how Gaussians at `means` [N, 3] look from `place` [3]."""
-        toward, distance = _directions(means, place)
-        cosine = torch.full_like(self.residual, -1.0)
-        nearest = torch.full_like(self.residual, torch.inf)
-        for rows, center in zip(self.rows, self.centers, strict=True):
-            ray, apart = _directions(means[rows], center)
-            cosine[rows] = torch.maximum(cosine[rows], (ray * toward[rows]).sum(1))
-            nearest[rows] = torch.minimum(nearest[rows], apart)
-        nearer = torch.log(nearest / distance).clamp(0, _MAX_NEARER)
-        return Sight(torch.arccos(cosine.clamp(-1, 1)),
-                     torch.where(torch.isinf(nearest), torch.zeros_like(nearer), nearer))
+        rays, (toward, distance) = self._rays(means), _directions(means, place)
+        seen = self.count > 0
+        cosine = rays.reduce("max", rays.cosines(toward)).clamp(-1, 1)
+        nearer = torch.log(rays.nearest / distance).clamp(0, _MAX_NEARER)
+        return Sight(torch.arccos(torch.where(seen, cosine, -1.0)),
+                     torch.where(seen, nearer, 0.0))
+
+    def _rays(self, means: Tensor) -> _Rays:
+        """Returns the rays to `means`; those to the last ones asked for are kept."""
+        kept = self._kept.get("rays")
+        if kept is None or kept.means is not means:
+            kept = self._kept["rays"] = _Rays.from_rows(self.rows, self.centers, self.count, means)
+        return kept
 
     def save(self, path: Path) -> None:
         """Writes the support as safetensors, atomically."""
@@ -186,7 +218,9 @@ def error_image(
         energy = (weighted * rgb).sum((0, 1))
         factor = (weighted * truth).sum((0, 1)) / np.maximum(energy, 1e-12)
         rgb = rgb * np.where(energy > 0, factor, 1).astype(np.float32)
-    return np.abs(rgb.clip(0, 1) - truth).mean(-1), counts
+    error = np.abs(rgb.clip(0, 1) - truth)
+    total = error[..., 0] + error[..., 1] + error[..., 2]  # `mean` takes three times as long
+    return np.asarray(total / 3, np.float32), counts
 
 
 def _pixels(means: Tensor, view: TrainView) -> tuple[Tensor, Tensor]:

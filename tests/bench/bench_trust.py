@@ -21,10 +21,9 @@ import cv2
 import numpy as np
 from workbench import numba_context, open_trained, print_head, print_row, workspaces_argument
 
-from recon_cli.evaluation.reference_views import load_reference_views
+from recon_cli.evaluation.reference_views import RenderedModel, load_reference_views
 from recon_cli.io.views import ReferenceView
 from recon_cli.machine import usable_threads
-from recon_cli.scene.splats import Splats
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.trust.agreement import ause
 from recon_cli.trust.error_model import picture_terms
@@ -33,16 +32,16 @@ from recon_cli.trust.support import error_image
 from recon_cli.trust.surface import find_cells, surface_shares
 
 
-def bounds(splats: Splats, trust: Trust, views: Sequence[ReferenceView]) -> tuple[float, float]:
+def bounds(
+    model: RenderedModel, trust: Trust, views: Sequence[ReferenceView]
+) -> tuple[float, float]:
     """Returns the AUSE of the real error's local mean, and of a random order."""
     rng, areas = np.random.default_rng(0), []
     for view in views:
-        picture = picture_terms(splats, trust.support, view.camera, sh_degree=trust.sh_degree,
-                                backend="numba")
+        picture = picture_terms(model, trust.support, view.camera)
         error = error_image(picture.rgb, view, gains=False)[0]
         flat = error.ravel().astype(np.float64)
-        areas.append((ause(flat, cv2.blur(error, (5, 5)).ravel()),
-                      ause(flat, rng.random(len(flat)))))
+        areas.append(ause(flat, cv2.blur(error, (5, 5)).ravel(), rng.random(len(flat))))
     low, high = np.mean(areas, axis=0)
     return float(low), float(high)
 
@@ -58,13 +57,13 @@ def main(workspaces: Sequence[Path]) -> None:
         config, scene, splats = open_trained(workspace)
         ctx = numba_context(usable_threads())
         start = process_time()
-        trust = measure_trust(splats, scene, config, config.max_size, ctx)
+        model = RenderedModel(splats, config.sh_degree, "numba")
+        trust = measure_trust(model, scene, config, config.max_size, ctx)
         took = process_time() - start
         views = load_reference_views(scene.test, config.max_size, ctx)
         surface = surface_shares(find_cells(splats, trust.support))
-        row = model_trust(
-            trust, splats, surface, views, gains=config.exposure == "on", backend="numba")
-        agreement, (low, high) = row.agreement, bounds(splats, trust, views)
+        row = model_trust(trust, model, surface, views, gains=config.exposure == "on")
+        agreement, (low, high) = row.agreement, bounds(model, trust, views)
         assert agreement is not None
         trained = seconds_at(workspace / "train" / LOG, 1 << 62, clock="cpu_seconds")
         areas = (agreement.ause, agreement.ause_opacity, agreement.ause_depth, low, high)

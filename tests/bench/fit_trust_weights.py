@@ -24,6 +24,7 @@ from workbench import numba_context, open_scene, print_head, print_row, workspac
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
+from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.machine import usable_threads
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene, View
@@ -87,12 +88,12 @@ def read_stretch(workspace: Path, max_size: int, iterations: int) -> tuple[Array
     """Returns the terms [P, K] of pixels in the stretch that was taken away, and their errors."""
     capture = open_capture(workspace, max_size, iterations)
     splats, scene = capture.train()
-    support = measure_trust(splats, scene, capture.config, max_size, capture.ctx).support
+    model = RenderedModel(splats, capture.config.sh_degree, "numba")
+    support = measure_trust(model, scene, capture.config, max_size, capture.ctx).support
     columns: list[Array] = []
     errors: list[Array] = []
     for view in load_views(capture.taken, capture.config, capture.ctx):
-        picture = picture_terms(splats, support, view.camera, sh_degree=capture.config.sh_degree,
-                                backend="numba")
+        picture = picture_terms(model, support, view.camera)
         error, counts = error_image(picture.rgb, view, gains=False)
         used = counts > 0
         errors.append(np.asarray(error[used], np.float64))

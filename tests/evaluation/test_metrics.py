@@ -9,7 +9,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from recon_cli.evaluation import metrics
-from recon_cli.evaluation.metrics import load_lpips, psnr, ssim
+from recon_cli.evaluation.metrics import both_ssim, load_lpips, psnr, ssim
 from recon_cli.io.images import to_uint8
 from recon_cli.scene.train_view import leaves_enough
 from recon_cli.train.gradient import photometric_loss
@@ -204,3 +204,26 @@ def test_a_backbone_that_is_damaged_is_named(backbone, monkeypatch):
     assert distance is None
     assert f"{backbone} is damaged" in reason
     assert "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth" in reason
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_both_forms_of_ssim_from_one_map_are_the_same_to_the_last_bit(masked, weighted):
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (37, 50, 3), dtype=np.uint8)
+    image = (0.8 * truth / 255 + 0.2 * rng.random(truth.shape)).astype(np.float32)
+    mask = rng.random(truth.shape[:2]) < 0.7 if masked else None
+    weights = rng.random(truth.shape[:2]) * (1 if mask is None else mask) if weighted else None
+    assert both_ssim(image, truth, mask, weights=weights) == (
+        ssim(image, truth, mask, weights=weights),
+        ssim(image, truth, mask, weights=weights, padded=True))
+
+
+def test_ssim_is_that_of_scikit_image_to_the_last_bit():
+    rng = np.random.default_rng(1)
+    truth = rng.integers(0, 256, (37, 50, 3), dtype=np.uint8)
+    image = rng.random(truth.shape).astype(np.float32)
+    expected = structural_similarity(
+        image.astype(np.float64), truth / 255.0, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, data_range=1.0, channel_axis=-1)
+    assert both_ssim(image, truth)[0] == expected

@@ -171,6 +171,27 @@ def test_trust_is_measured_checked_on_held_out_views_and_drawn(inputs, tmp_path)
     assert all(line.startswith("poorly seen (") for line in summary.poorly_seen)
 
 
+def test_trust_renders_no_view_again_that_scoring_rendered(inputs, tmp_path, monkeypatch):
+    drawn = []
+    render_view = reference_views.render_view
+
+    def count(splats, camera, *arguments):
+        drawn.append((len(splats), reference_views._key(camera)))
+        return render_view(splats, camera, *arguments)
+
+    monkeypatch.setattr(reference_views, "render_view", count)
+    run(evaluate, EvaluateConfig(), inputs, tmp_path / "a")
+    assert len(drawn) == len(set(drawn))
+    monkeypatch.setattr(evaluate, "_ROOM", 0)
+    drawn.clear()
+    run(evaluate, EvaluateConfig(), inputs, tmp_path / "b")
+    assert len(drawn) > len(set(drawn))
+    for path in sorted((tmp_path / "a" / "trust").rglob("*")):
+        if path.is_file():
+            assert path.read_bytes() == (
+                tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
+
+
 def test_held_out_views_calibrate_nothing(inputs, tmp_path):
     changed = tmp_path / "sfm"
     shutil.copytree(inputs.folders["sfm"], changed)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from small_room import camera, dots, photo, room
 
+from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.render import render
 from recon_cli.scene.splats import SH_C0
 from recon_cli.trust.error_model import (
@@ -65,14 +66,14 @@ def test_holes_and_sides_that_no_view_shows_are_not_trusted():
     eyes = [[0, y, 1.5] for y in (-0.5, 0.0, 0.5)]
     views = [photo(splats, camera(eye, [2, eye[1], 1.2])) for eye in eyes]  # the wall at x = 2
     support = measure_support(splats, views, sh_degree=0, backend="torch")
-    model = calibrate(splats, support, [photo(splats, camera([0, 0.25, 1.5], [2, 0.2, 1.2]))],
-                      views, sh_degree=0, backend="torch")
+    rendered = RenderedModel(splats, 0, "torch")
+    model = calibrate(
+        rendered, support, [photo(splats, camera([0, 0.25, 1.5], [2, 0.2, 1.2]))], views)
     assert model.calibrated
-    assert calibrate(splats, support, [], views, sh_degree=0, backend="torch").calibrated is False
+    assert calibrate(rendered, support, [], views).calibrated is False
 
     def expect(target):
-        picture = picture_terms(
-            splats, support, camera([0, 0.1, 1.5], target), sh_degree=0, backend="torch")
+        picture = picture_terms(rendered, support, camera([0, 0.1, 1.5], target))
         return picture, model.expect(picture.terms)
 
     _, seen = expect([2, 0, 1.2])

@@ -43,6 +43,16 @@ def test_a_place_is_compared_with_the_nearest_ray_and_the_nearest_distance():
     assert float(farther.nearer[0]) == 0
 
 
+def test_rays_are_those_to_the_means_that_are_given():
+    splats = dots([[0, 0, 0]], radius=0.2)
+    support = measure(splats, [photo(splats, camera(eye, [0, 0, 0])) for eye in EYES])
+    assert np.degrees(float(support.span(splats.means)[0])) == pytest.approx(90, abs=0.1)
+    farther = splats.means + torch.tensor([[-2.0, 2.0, 0.0]])  # on the axis of both eyes' square
+    assert np.degrees(float(support.span(farther)[0])) == pytest.approx(
+        np.degrees(2 * np.arctan2(2**0.5, 3 * 2**0.5)), abs=0.1)
+    assert np.degrees(float(support.span(splats.means)[0])) == pytest.approx(90, abs=0.1)
+
+
 def test_an_unseen_gaussian_is_at_the_widest_angle():
     splats = dots([[0, 0, 0], [0, -9, 0]], radius=0.2)
     support = measure(splats, [photo(splats, camera([0, -2, 0], [0, 0, 0]))])
