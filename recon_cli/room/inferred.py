@@ -36,8 +36,7 @@ _REACH = 3.0  # cells, from a plane to the surface of another one that meets it
 _AROUND = 80  # cells, within which what surrounds a hole lies in each of eight directions
 _MARGIN = 40  # cells around the surface of a plane, to the lines in which it meets others
 _AGREE = 0.05  # of a depth, within which a view shows the plane, not what lies behind it
-_LEAST_AGREE = 2  # views that show it there
-_MOST_CROSSED = 0.25  # share of them and of those whose rays cross it, that may cross it
+_MOST_CROSSED = 0.1  # share of them and of those whose rays cross it, that may cross it
 _MOST_VIEWS = 100  # that are asked about a hole
 _LEAST_CELLS = 12  # of a hole
 _MOST_CELLS = 4_000_000  # of the grid of a plane
@@ -240,7 +239,10 @@ def _pad_close(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _is_plane(
     places: NDArray[np.float64], views: Sequence[_Look]
 ) -> NDArray[np.bool_]:
-    """Returns at which places [N] views show the plane, and next to none looks through it."""
+    """Returns at which places [N] views show the plane, and next to none looks through it.
+
+    Where one view alone shows it, none does.
+    """
     agree, crossed = np.zeros((2, len(places)))
     for view in views:
         z, inside, row, column = _pixels(view.camera, places)
@@ -249,7 +251,7 @@ def _is_plane(
         looks = inside & ~hidden & (seen > 0)
         agree += looks & (np.abs(seen - z) <= _AGREE * z)
         crossed += looks & (seen > (1 + _AGREE) * z)
-    return np.asarray((agree >= _LEAST_AGREE) & (crossed <= _MOST_CROSSED * (agree + crossed)))
+    return np.asarray((agree > 0) & (crossed <= _MOST_CROSSED * (agree + crossed)))
 
 
 def _pixels(

@@ -60,12 +60,16 @@ def texture_colors(mesh: Mesh, camera: Camera, drawn: Drawn) -> NDArray[np.float
 @workspace_argument
 @click.option("--threads", default=2, show_default=True)
 @click.option("--size", default=4096, show_default=True, help="Texels of a side.")
+@click.option("--max-size", type=int, help="Longest side of the images.  [default: as trained]")
 @click.option("--mesh", "kept", type=click.Path(path_type=Path), help="Keep the mesh here.")
-def main(workspace: Path, threads: int, size: int, kept: Path | None) -> None:
+def main(
+    workspace: Path, threads: int, size: int, max_size: int | None, kept: Path | None
+) -> None:
     """Prints the table."""
     config, scene, splats = open_trained(workspace)
     ctx = numba_context(threads)
-    views = load_views(scene.train, config.max_size, "not used", denoised=True)
+    max_size = max_size or config.max_size
+    views = load_views(scene.train, max_size, "not used", denoised=True)
     if kept is not None and kept.exists():
         found = np.load(kept)
         mesh = Mesh(found["vertices"], found["faces"], found["colors"])
@@ -78,7 +82,7 @@ def main(workspace: Path, threads: int, size: int, kept: Path | None) -> None:
     seconds = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     scores = []
-    for view in load_views(scene.test, config.max_size, "not used"):
+    for view in load_views(scene.test, max_size, "not used"):
         drawn = draw_mesh(view.camera, mesh.vertices, mesh.faces)
         shown = drawn.owners >= 0
         counts = np.ones(shown.sum(), bool) if view.mask is None else view.mask[shown]

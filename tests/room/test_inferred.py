@@ -86,6 +86,26 @@ def test_a_hole_that_views_do_not_confirm_stays_open(depth_at):
     assert infer_surface(wall(square), maps_of(depth_at), VOXEL) is None
 
 
+def in_hole(*depths):
+    """Depth maps of a wall, whose hole has one of the depths in each view."""
+    maps = maps_of(blank)
+    for row, depth in enumerate(depths):
+        own = maps_of(lambda y, z, depth=depth: np.where(square(y, z), depth, 2.0))
+        maps.depths[row] = own.depths[row]
+    return maps
+
+
+def test_a_hole_that_one_view_in_six_looks_through_stays_open():
+    assert infer_surface(wall(square), in_hole(5.0), VOXEL) is None
+
+
+def test_one_view_shows_a_hole_that_the_others_know_nothing_of():
+    found = infer_surface(wall(square), in_hole(2.0, 0.0, 0.0, 0.0, 0.0, 0.0), VOXEL)
+    assert area(found) > 0.9 * (2 * HOLE) ** 2
+    assert infer_surface(
+        wall(square), in_hole(2.0, 5.0, 0.0, 0.0, 0.0, 0.0), VOXEL) is None  # and one looks through
+
+
 def test_a_bay_at_the_rim_of_a_wall_stays_open():
     bay = wall(lambda y, z: (np.abs(y) < HOLE) & (z > -HOLE))
     assert infer_surface(bay, maps_of(blank), VOXEL) is None
