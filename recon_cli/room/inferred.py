@@ -134,7 +134,7 @@ def _close(
         return None
     places = grid.places(rows, columns, np.zeros(len(rows)), 0.5)
     holes[rows, columns] = _is_plane(places, views)
-    holes = _without_specks(_adjoining(holes, confirmed, lines))
+    holes = _without_specks(_adjoining(holes, confirmed, lines | meets))
     if not holes.any():
         return None
     return _sheet(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
@@ -221,10 +221,14 @@ def _is_surrounded(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _adjoining(
     holes: NDArray[np.bool_], confirmed: NDArray[np.bool_], lines: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Returns the holes that reach surface of their plane without crossing a line."""
+    """Returns the holes that reach surface of their plane without crossing a line.
+
+    Of the `lines`, where others meet the plane, those at a hole or surface: alone they would be
+    a ledge along a wall.
+    """
     parts, _ = label((holes & ~lines) | confirmed)
     kept = holes & ~lines & np.isin(parts, np.unique(parts[confirmed]))
-    at_line = cv2.dilate(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    at_line = cv2.dilate((kept | confirmed).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return np.asarray(kept | (holes & lines & at_line))
 
 

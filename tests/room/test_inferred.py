@@ -153,6 +153,24 @@ def test_a_bay_is_filled_up_to_the_line_of_a_plane_whose_surface_ends_before_it(
     assert np.ptp(in_bay[:, 1]) > 2 * HOLE - VOXEL
 
 
+def test_a_table_at_a_wall_gets_no_ledge_along_it():
+    whole = wall(lambda y, _: y > 9)
+    x, y = (grid.ravel() for grid in np.meshgrid(
+        2.0 - VOXEL * np.arange(16), VOXEL * np.arange(-8, 9), indexing="ij"))
+    row, column = (g.ravel() for g in np.meshgrid(np.arange(15), np.arange(16)))
+    a = row * 17 + column
+    faces = np.concatenate([np.stack([a, a + 17, a + 1], 1),
+                            np.stack([a + 1, a + 17, a + 18], 1)])[:, ::-1]  # upwards
+    table = np.stack([x, y, np.zeros(len(x))], axis=1)
+    a, b, c = table[faces[0]]
+    assert np.cross(b - a, c - a)[2] > 0
+    both = Mesh(np.concatenate([whole.vertices, table]),
+                np.concatenate([whole.faces, faces + len(whole.vertices)]),
+                np.zeros((len(whole.vertices) + len(table), 3), np.uint8))
+    found = infer_surface(both, maps_of(blank), VOXEL)
+    assert found is None or np.abs(found.vertices[:, 1]).max() < 8 * VOXEL + 4 * VOXEL
+
+
 def test_a_hole_is_surrounded_only_if_something_lies_near_in_all_eight_directions():
     cells = np.zeros((40, 40), bool)
     cells[10, 10:31] = cells[30, 10:31] = cells[10:31, 10] = cells[10:31, 30] = True
