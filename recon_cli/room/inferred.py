@@ -36,8 +36,7 @@ _REACH = 3.0  # cells, from a plane to the surface of another one that meets it
 _AROUND = 80  # cells, within which what surrounds a hole lies in each of eight directions
 _MARGIN = 40  # cells around the surface of a plane, to the lines in which it meets others
 _AGREE = 0.05  # of a depth, within which a view shows the plane, not what lies behind it
-_LEAST_AGREE = 2  # views that show it there
-_MOST_CROSSED = 0.25  # share of them and of those whose rays cross it, that may cross it
+_MOST_CROSSED = 0.1  # share of them and of those whose rays cross it, that may cross it
 _MOST_VIEWS = 100  # that are asked about a hole
 _LEAST_CELLS = 12  # of a hole
 _MOST_CELLS = 4_000_000  # of the grid of a plane
@@ -135,7 +134,7 @@ def _close(
         return None
     places = grid.places(rows, columns, np.zeros(len(rows)), 0.5)
     holes[rows, columns] = _is_plane(places, views)
-    holes = _without_specks(_adjoining(holes, confirmed, lines))
+    holes = _without_specks(_adjoining(holes, confirmed, lines | meets))
     if not holes.any():
         return None
     return _sheet(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
@@ -222,10 +221,14 @@ def _is_surrounded(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _adjoining(
     holes: NDArray[np.bool_], confirmed: NDArray[np.bool_], lines: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Returns the holes that reach surface of their plane without crossing a line."""
+    """Returns the holes that reach surface of their plane without crossing a line.
+
+    Of the `lines`, where others meet the plane, those at a hole or surface: alone they would be
+    a ledge along a wall.
+    """
     parts, _ = label((holes & ~lines) | confirmed)
     kept = holes & ~lines & np.isin(parts, np.unique(parts[confirmed]))
-    at_line = cv2.dilate(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    at_line = cv2.dilate((kept | confirmed).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return np.asarray(kept | (holes & lines & at_line))
 
 
@@ -240,7 +243,10 @@ def _pad_close(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _is_plane(
     places: NDArray[np.float64], views: Sequence[_Look]
 ) -> NDArray[np.bool_]:
-    """Returns at which places [N] views show the plane, and next to none looks through it."""
+    """Returns at which places [N] views show the plane, and next to none looks through it.
+
+    Where one view alone shows it, none does.
+    """
     agree, crossed = np.zeros((2, len(places)))
     for view in views:
         z, inside, row, column = _pixels(view.camera, places)
@@ -249,7 +255,7 @@ def _is_plane(
         looks = inside & ~hidden & (seen > 0)
         agree += looks & (np.abs(seen - z) <= _AGREE * z)
         crossed += looks & (seen > (1 + _AGREE) * z)
-    return np.asarray((agree >= _LEAST_AGREE) & (crossed <= _MOST_CROSSED * (agree + crossed)))
+    return np.asarray((agree > 0) & (crossed <= _MOST_CROSSED * (agree + crossed)))
 
 
 def _pixels(

@@ -7,12 +7,16 @@ F-scores, precision and recall at 5 and 2 cm, triangles, seconds, CPU seconds an
 reference are the exact depth maps, fused at 3 cm; 1.5 cm are allowed for that spacing, and only
 what at least three training views show counts for the recall. Exact depth is there for every fifth
 view of the path and for the test views: its recall is also printed for what three of those show.
+A second table says how much of the room's walls, floor and ceiling (where they are, not furniture
+before them) three training views show, how much of that stays open, with no surface within 5 cm,
+without and with inferred surface, and how much of that surface lies near the truth.
 Nothing is chosen here by test views: their exact depth is part of the reference alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import resource
 import time
 from collections.abc import Callable, Sequence
@@ -38,7 +42,7 @@ ROOMS = Path(__file__).resolve().parents[3] / "shared" / "data" / "rooms"
 SPACING, DENSE = 0.03, 0.01  # metres
 SAMPLES = 400_000
 THRESHOLDS = (0.05, 0.02)
-SIZE = 600
+ON_WALL = 0.02  # metres, within which a point is one of a wall, floor or ceiling
 
 
 def exact_depths(room: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float64]]]:
@@ -102,17 +106,65 @@ def project(
     return z, inside, np.where(inside, v * camera.width + u, 0).astype(np.int64)
 
 
-def f_scores(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], points: NDArray[np.float64],
-    shown: NDArray[np.bool_],
-) -> str:
-    """Returns F-score, precision and recall at each threshold as cells of a table."""
+def sampled(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], float]:
+    """Returns points evenly over triangles, and the area of the triangles."""
     generator = np.random.default_rng(0)
     a, b, c = np.swapaxes(vertices[faces], 0, 1)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     rows = generator.choice(len(faces), SAMPLES, p=areas / areas.sum())
     r, s = np.sqrt(generator.random((SAMPLES, 1))), generator.random((SAMPLES, 1))
-    samples = a[rows] * (1 - r) + b[rows] * r * (1 - s) + c[rows] * r * s
+    return (a[rows] * (1 - r) + b[rows] * r * (1 - s) + c[rows] * r * s,
+            float(areas.sum()) / 2)
+
+
+def wall_points(room: Path, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the points [W, 3] that are of walls, floor and ceiling, one in 3 cm of each."""
+    kept = []
+    for axis, length in enumerate(json.loads((room / "meta.json").read_text())["size_m"]):
+        for offset in (0.0, length):
+            wall = points[np.abs(points[:, axis] - offset) < ON_WALL]
+            cells = np.floor(np.delete(wall, axis, axis=1) / SPACING).astype(np.int64)
+            kept.append(wall[np.unique(cells, axis=0, return_index=True)[1]])
+    return np.concatenate(kept)
+
+
+def print_walls(
+    walls: NDArray[np.float64], points: NDArray[np.float64], result: build.MeshResult,
+    moved: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> None:
+    """Prints what of the walls that three views show stays open, and what was closed.
+
+    `walls` [W, 3] are points of walls, `points` [P, 3] of everything that can be seen.
+    """
+    click.echo()
+    print_head("walls, m2", "open", "open with inferred surface", "of that closed",
+               "inferred, m2", "within 5 cm", "within 10 cm")
+    surface, _ = sampled(moved(result.mesh.vertices), result.mesh.faces)
+    far = _is_far(walls, surface)
+    cells = [f"{len(walls) * SPACING**2:.1f}", f"{far.mean():.3f}"]
+    if result.inferred is not None:
+        inferred, area = sampled(moved(result.inferred.vertices), result.inferred.faces)
+        left = far & _is_far(walls, inferred)
+        errors = cKDTree(points).query(inferred, distance_upper_bound=0.3)[0]
+        cells += [f"{left.mean():.3f}", f"{1 - left.sum() / far.sum():.2f}", f"{area:.2f}",
+                  *(f"{(errors <= limit + SPACING / 2).mean():.3f}" for limit in (0.05, 0.1))]
+    print_row(*cells)
+
+
+def _is_far(points: NDArray[np.float64], surface: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Returns which points have no surface within the first threshold."""
+    return np.asarray(cKDTree(surface).query(
+        points, distance_upper_bound=0.3)[0] > THRESHOLDS[0])
+
+
+def f_scores(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], points: NDArray[np.float64],
+    shown: NDArray[np.bool_],
+) -> str:
+    """Returns F-score, precision and recall at each threshold as cells of a table."""
+    samples, _ = sampled(vertices, faces)
     to_reference = cKDTree(points).query(samples, distance_upper_bound=0.3)[0]
     to_mesh = cKDTree(samples).query(points[shown], distance_upper_bound=0.3)[0]
     cells = []
@@ -150,8 +202,12 @@ def copy(maps: DepthMaps) -> DepthMaps:
 @click.argument("room")
 @click.option("--threads", default=2, show_default=True)
 @click.option("--triangles", default=300_000, show_default=True)
+@click.option("--size", default=600, show_default=True, help="Longest side of the images.")
 @click.option("--video", is_flag=True, help="The workspace was made from the video of ROOM.")
-def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) -> None:
+@click.option("--short", is_flag=True, help="Only the whole export.")
+def main(
+    workspace: Path, room: str, threads: int, triangles: int, size: int, video: bool, short: bool
+) -> None:
     """Prints the table."""
     _, scene, splats = open_trained(workspace)
     ctx = numba_context(threads)
@@ -171,8 +227,7 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         scores = f_scores(moved(vertices), faces, points, shown)
         print_row(name, scores, f"{len(faces):,}", f"{seconds:.1f}", f"{cpu:.1f}", f"{peak:.0f}")
 
-    views = load_views(scene.train, SIZE, "not used")
-    maps = render_depth_maps(splats, views, "numba")
+    views = load_views(scene.train, size, "not used")
 
     def fused(some: DepthMaps, *, agreement: bool) -> tuple[
             NDArray[np.float64], NDArray[np.int64]]:
@@ -181,11 +236,20 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
         voxel, farthest = build._fit_voxel(some, None, ctx)
         return extract(fuse(some, voxel, farthest))
 
-    def built(some: list[TrainView]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        mesh = build.build_mesh(splats, some, None, ctx, max_triangles=triangles).mesh
-        return mesh.vertices, mesh.faces
+    results: list[build.MeshResult] = []
 
-    row("whole export, with rendering and stereo", lambda: built(views))
+    def exported() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        results.append(build.build_mesh(
+            splats, views, None, ctx, max_triangles=triangles, infer=True))
+        return results[0].mesh.vertices, results[0].mesh.faces
+
+    row("whole export, with rendering and stereo", exported)
+    walls = wall_points(ROOMS / room, points[shown])
+    if short:
+        print_walls(walls, points, results[0], moved)
+        return
+
+    maps = render_depth_maps(splats, views, "numba")
     row("median along the ray, fused", lambda: fused(copy(maps), agreement=False))
     row("and weighed by agreement", lambda: fused(copy(maps), agreement=True))
 
@@ -195,22 +259,22 @@ def main(workspace: Path, room: str, threads: int, triangles: int, video: bool) 
 
     row("and only what views show: all but stereo", without_stereo)
 
-    if video:
-        return
+    if not video:
+        rows = exact_depths(ROOMS / room)
+        cameras = [dataclasses.replace(scene.train[0].camera, viewmat=pose) for _, pose in rows]
 
-    rows = exact_depths(ROOMS / room)
-    cameras = [dataclasses.replace(scene.train[0].camera, viewmat=pose) for _, pose in rows]
+        def exact() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+            depths = [depth for depth, _ in rows]
+            blank = [TrainView(camera, np.zeros((camera.height, camera.width, 3), np.uint8))
+                     for camera in cameras]
+            whole = weigh(blank, cameras, depths, [np.ones_like(depth) for depth in depths])
+            mesh = build.mesh_of(whole, None, ctx, max_triangles=triangles).mesh
+            return mesh.vertices, mesh.faces
 
-    def exact() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        depths = [depth for depth, _ in rows]
-        blank = [TrainView(camera, np.zeros((camera.height, camera.width, 3), np.uint8))
-                 for camera in cameras]
-        whole = weigh(blank, cameras, depths, [np.ones_like(depth) for depth in depths])
-        mesh = build.mesh_of(whole, None, ctx, max_triangles=triangles).mesh
-        return mesh.vertices, mesh.faces
+        row("exact depth of a fifth of the views, the same way", exact)
+        row("the same, where three of those views look", exact, shown_by(cameras, points, dense))
 
-    row("exact depth of a fifth of the views, the same way", exact)
-    row("the same, where three of those views look", exact, shown_by(cameras, points, dense))
+    print_walls(walls, points, results[0], moved)
 
 
 if __name__ == "__main__":

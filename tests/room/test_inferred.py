@@ -86,6 +86,26 @@ def test_a_hole_that_views_do_not_confirm_stays_open(depth_at):
     assert infer_surface(wall(square), maps_of(depth_at), VOXEL) is None
 
 
+def in_hole(*depths):
+    """Depth maps of a wall, whose hole has one of the depths in each view."""
+    maps = maps_of(blank)
+    for row, depth in enumerate(depths):
+        own = maps_of(lambda y, z, depth=depth: np.where(square(y, z), depth, 2.0))
+        maps.depths[row] = own.depths[row]
+    return maps
+
+
+def test_a_hole_that_one_view_in_six_looks_through_stays_open():
+    assert infer_surface(wall(square), in_hole(5.0), VOXEL) is None
+
+
+def test_one_view_shows_a_hole_that_the_others_know_nothing_of():
+    found = infer_surface(wall(square), in_hole(2.0, 0.0, 0.0, 0.0, 0.0, 0.0), VOXEL)
+    assert area(found) > 0.9 * (2 * HOLE) ** 2
+    assert infer_surface(
+        wall(square), in_hole(2.0, 5.0, 0.0, 0.0, 0.0, 0.0), VOXEL) is None  # and one looks through
+
+
 def test_a_bay_at_the_rim_of_a_wall_stays_open():
     bay = wall(lambda y, z: (np.abs(y) < HOLE) & (z > -HOLE))
     assert infer_surface(bay, maps_of(blank), VOXEL) is None
@@ -131,6 +151,24 @@ def test_a_bay_is_filled_up_to_the_line_of_a_plane_whose_surface_ends_before_it(
     assert in_bay[:, 2].max() <= HALF + 2 * VOXEL + 1e-9
     assert in_bay[:, 2].max() > HALF - 2 * VOXEL
     assert np.ptp(in_bay[:, 1]) > 2 * HOLE - VOXEL
+
+
+def test_a_table_at_a_wall_gets_no_ledge_along_it():
+    whole = wall(lambda y, _: y > 9)
+    x, y = (grid.ravel() for grid in np.meshgrid(
+        2.0 - VOXEL * np.arange(16), VOXEL * np.arange(-8, 9), indexing="ij"))
+    row, column = (g.ravel() for g in np.meshgrid(np.arange(15), np.arange(16)))
+    a = row * 17 + column
+    faces = np.concatenate([np.stack([a, a + 17, a + 1], 1),
+                            np.stack([a + 1, a + 17, a + 18], 1)])[:, ::-1]  # upwards
+    table = np.stack([x, y, np.zeros(len(x))], axis=1)
+    a, b, c = table[faces[0]]
+    assert np.cross(b - a, c - a)[2] > 0
+    both = Mesh(np.concatenate([whole.vertices, table]),
+                np.concatenate([whole.faces, faces + len(whole.vertices)]),
+                np.zeros((len(whole.vertices) + len(table), 3), np.uint8))
+    found = infer_surface(both, maps_of(blank), VOXEL)
+    assert found is None or np.abs(found.vertices[:, 1]).max() < 8 * VOXEL + 4 * VOXEL
 
 
 def test_a_hole_is_surrounded_only_if_something_lies_near_in_all_eight_directions():
