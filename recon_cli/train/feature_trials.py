@@ -284,16 +284,14 @@ class _Bench:
         rows = order[first_look(len(views))]
         looked = judge.compare(model, [views[row] for row in rows])
         moved = self._find_moved(model, views, judge, order) if was_moved(looked) else None
-        shown, clearer = views, model
-        if moved is not None:  # whose model has no ghost of what was moved
-            shown = hide(views, moved)
-            clearer = self._probe(config, [view for view in shown[:len(task.train)]
-                                           if leaves_enough(view.mask)], SIDE)
-            looked = judge.compare(clearer, [shown[row] for row in rows])
         signs = find_signs(looked)
         if config.moving == "on" or are_enough(signs):
+            if moved is not None:  # a model without its ghost
+                views = hide(views, moved)
+                model = self._probe(config, [view for view in views[:len(task.train)]
+                                             if leaves_enough(view.mask)], SIDE)
             regions = search(
-                clearer, shown, range(len(task.train)), judge, partial(self._probe, config))
+                model, views, range(len(task.train)), judge, partial(self._probe, config))
             regions = regions if moved is None else join(moved, regions)
         elif moved is not None:
             regions = moved
@@ -310,7 +308,8 @@ class _Bench:
         elif config.moving == "on":
             decision = replace(skip_trial("moving", "asked for"), on=True)
         else:
-            decision = self._try_masks(config, model, hide(views, regions))
+            decision = self._try_masks(
+                config, self.model(config, self._moving_level), hide(views, regions))
         decisions.append(replace(decision, seconds=time.perf_counter() - start))
         return regions if decision.on else None
 
