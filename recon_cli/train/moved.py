@@ -174,16 +174,15 @@ def hide_rarer(views: Sequence[ComparedView]) -> Regions:
     parts, space = Parts.halves(views), Space.of_views(views)
     regions = parts.contradictions()
     hidden = [np.zeros(region.shape, np.bool_) for region in regions]
-    for part, cells in enumerate(parts.find_cells(space, regions, _SHOWS)):
-        for thing in _joined(cells, space):
-            looks = [space.look(view, thing) for view in views]
-            sights = np.array([len(seen) for seen, _ in looks])  # views, by the share they see
-            rarer = bool(sights[parts.late].sum() < sights[~parts.late].sum())
-            for row in np.flatnonzero(parts.late == rarer).tolist():
-                there = _outline(space, views[row], looks[row])
-                if rarer == bool(part):  # it shows the thing, with its shadow
-                    there |= _touched(regions[row], there)
-                hidden[row] |= there
+    # what touches is one thing, whichever half errs against the model's mixture of both states
+    for thing in _joined(np.logical_or(*parts.find_cells(space, regions, _SHOWS)), space):
+        looks = [space.look(view, thing) for view in views]
+        sights = np.array([len(seen) for seen, _ in looks])  # views, by the share they see
+        rarer = bool(sights[parts.late].sum() < sights[~parts.late].sum())
+        for row in np.flatnonzero(parts.late == rarer).tolist():
+            there = _outline(space, views[row], looks[row])
+            # a region there is the thing with its shadow
+            hidden[row] |= there | _touched(regions[row], there)
     return hidden
 
 
