@@ -11,6 +11,7 @@ against runs of full length.
 from __future__ import annotations
 
 import dataclasses
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -32,14 +33,17 @@ from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.motion_blur import blurred_psnr
+from recon_cli.train.moved import hide_rarer, was_moved
 from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_search import (
     Judge,
     Regions,
     are_enough,
     find_signs,
+    first_look,
     hide,
     is_plausible,
+    join,
     search,
     share_of,
 )
@@ -68,6 +72,7 @@ _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there
 _POINTS = 5000
 _CAP = 10_000
 _LEAST_SEARCHED = 1000  # steps of a run in which what moves is looked for
+logger = logging.getLogger("recon")
 PARTS = ("far", "stereo", "exposure", "vignette", "tone", "images", "depth", "blur")
 
 
@@ -101,6 +106,8 @@ class TrialScene:
     # reads the denoised training and validation views; None where the task's views are the same
     twins: Callable[[], tuple[list[TrainView], list[TrainView]]] | None
     harmonics: bool = False  # the degree of the colours is left to a trial
+    # of the training views, then of the validation views; they sort as they were taken
+    names: tuple[str, ...] = ()
 
 
 def examine(scene: TrialScene) -> Needs:
@@ -274,13 +281,27 @@ class _Bench:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
-        model = self.model(config)
-        if config.moving == "auto" and not are_enough(signs := find_signs(model, views, judge)):
+        model = self.model(config, self._moving_level)
+        order = np.argsort(self._scene.names) if self._scene.names else np.arange(len(views))
+        rows = order[first_look(len(views))]
+        looked = judge.compare(model, [views[row] for row in rows])
+        moved = self._find_moved(model, views, judge, order) if was_moved(looked) else None
+        signs = find_signs(looked)
+        if config.moving == "on" or are_enough(signs):
+            if moved is not None:  # a model without its ghost
+                views = hide(views, moved)
+                model = self._probe(config, [view for view in views[:len(task.train)]
+                                             if leaves_enough(view.mask)], SIDE)
+            regions = search(
+                model, views, range(len(task.train)), judge, partial(self._probe, config))
+            regions = regions if moved is None else join(moved, regions)
+        elif moved is not None:
+            regions = moved
+        else:
             decisions.append(replace(skip_trial(
                 "moving", f"{signs.sum()} of {len(signs)} views contradict the others"),
                 seconds=time.perf_counter() - start))
             return None
-        regions = search(model, views, range(len(task.train)), judge, partial(self._probe, config))
         if not any(region.any() for region in regions):
             decision = skip_trial("moving", "what contradicted other views was not found again")
         elif not is_plausible(regions):
@@ -289,9 +310,28 @@ class _Bench:
         elif config.moving == "on":
             decision = replace(skip_trial("moving", "asked for"), on=True)
         else:
-            decision = self._try_masks(config, model, hide(views, regions))
+            decision = self._try_masks(
+                config, self.model(config, self._moving_level), hide(views, regions))
         decisions.append(replace(decision, seconds=time.perf_counter() - start))
         return regions if decision.on else None
+
+    @staticmethod
+    def _find_moved(
+        model: Splats, views: Sequence[TrainView], judge: Judge, order: NDArray[np.int64]
+    ) -> Regions:
+        """Returns where each view shows what was moved half-way in the rarer of its states."""
+        hidden = hide_rarer(judge.compare(model, [views[row] for row in order]))
+        regions = [hidden[place] for place in np.argsort(order)]
+        logger.info("moving: something was moved half-way; %.1f%% of the pixels of %d of %d views "
+                    "show where it was seen less", 100 * share_of(regions),
+                    sum(region.any() for region in regions), len(views))
+        return regions
+
+    @property
+    def _moving_level(self) -> int:
+        """What views are reduced by, to no less than those that are compared."""
+        camera = self._scene.task.train[0].camera
+        return max(1, min(LEVEL, round(max(camera.width, camera.height) / SIDE)))
 
     def _try_masks(
         self, config: RunConfig, model: Splats, masked: list[TrainView]
@@ -301,22 +341,23 @@ class _Bench:
         They need not gain in these few steps, in which few Gaussians follow what moves.
         """
         rows, _ = self._views()
-        task = self._scene.task
+        task, level = self._scene.task, self._moving_level
         chosen = split(len(task.train), len(task.validation))
         assert chosen is not None
         offset = 0 if chosen.own else len(task.train)
         held_out = [view for view in (masked[offset + row] for row in chosen.held_out)
-                    if leaves_enough(reduce_view(view, LEVEL).mask)]
+                    if leaves_enough(reduce_view(view, level).mask)]
         if len(held_out) < 2:
             return skip_trial("moving", "too little of the views to score is left")
         config = self._short(config)
 
         def score(splats: Splats) -> list[float]:
-            return self._score(splats, held_out, config)
+            return self._score(splats, held_out, config, level)
 
         return decide("moving", (
             lambda: score(model),
-            lambda: score(self._fit(config, [masked[row] for row in rows]).splats)),
+            lambda: score(self._fit(
+                config, [masked[row] for row in rows], factor=level).splats)),
             unless_worse=True)
 
     def _probe(self, config: RunConfig, views: Sequence[TrainView], side: int) -> Splats:

@@ -104,7 +104,7 @@ def _grid(depth: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.asarray(pixels[depth.reshape(-1)[pixels] > 0], np.int64)
 
 
-def _project(
+def project(
     camera: Camera, where: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Returns column and line, from the centre of the first pixel, and depth of places [N, 3]."""
@@ -117,7 +117,7 @@ def _project(
 
 def _sees(view: ComparedView, where: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Returns which places [N, 3] are on the surface that a view sees, and count there."""
-    column, line, depth = _project(view.camera, where)
+    column, line, depth = project(view.camera, where)
     u, v = (np.rint(np.clip(item, -2, 1 << 20)).astype(np.int64) for item in (column, line))
     inside = (depth > 0) & (u >= 0) & (v >= 0) & (
         u < view.camera.width) & (v < view.camera.height)
@@ -155,7 +155,7 @@ def contradict(
     for row, index in zip(errors, others, strict=True):
         other = views[index]
         visible = _sees(other, where)
-        column, line, _ = _project(other.camera, where[visible])
+        column, line, _ = project(other.camera, where[visible])
         row[visible] = _sample(other.error, column, line)
     count = np.isfinite(errors[..., 0]).sum(axis=0)
     told = count >= _LEAST
@@ -206,9 +206,9 @@ _MARGIN = 2  # pixels that a region is widened by
 SURE, _SPREAD_FLOOR = 12.0, 0.001
 # A tenth of it must stand out clearly: shadows of whoever films stay below .21 (fox), people had
 # more than .3. And half of it must be seen by so many others.
-_CLEAR, _WITNESSES = 0.22, 4
+CLEAR, _WITNESSES = 0.22, 4
 _REACH = 0.12  # of the longer side: a faint part is no farther from a strong one
-_ALONE = 0.8  # of _CLEAR: what a view errs by where it contradicts others
+_ALONE = 0.8  # of CLEAR: what a view errs by where it contradicts others
 # Share of the views of a surface that may show something else there. Where more do, as at a window
 # or a mirror, it is the model that is wrong.
 _FEW = 0.5
@@ -225,7 +225,9 @@ def _length(error: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.square(error).mean(axis=-1)), np.float32)
 
 
-def find_suspects(view: ComparedView, noise: float) -> NDArray[np.bool_]:
+def find_suspects(
+    view: ComparedView, noise: float, clear: float = CLEAR
+) -> NDArray[np.bool_]:
     """Returns where a view differs enough from its render to be compared with others, [H, W].
 
     What moves errs by itself about as much as it contradicts others, so that most regions of most
@@ -236,7 +238,7 @@ def find_suspects(view: ComparedView, noise: float) -> NDArray[np.bool_]:
     result = np.zeros(weak.shape, np.bool_)
     for region in _components(weak):
         if _is_large(region, strong) and np.quantile(
-                error[region & (error >= _TELLS)], 0.9) >= _ALONE * _CLEAR:
+                error[region & (error >= _TELLS)], 0.9) >= _ALONE * clear:
             result |= region
     return np.asarray(cv2.dilate(result.astype(np.uint8), _disc(_MARGIN)) > 0)
 
@@ -265,7 +267,7 @@ def _is_large(region: NDArray[np.bool_], strong: NDArray[np.bool_]) -> bool:
 
 
 def find_regions(
-    found: Contradiction, noise: float, agreed: float = SURE
+    found: Contradiction, noise: float, agreed: float = SURE, clear: float = CLEAR
 ) -> NDArray[np.bool_]:
     """Returns where a view shows what moves, [H, W]: connected, large and contradicted."""
     strong, weak = _thresholds(found.amount - _BEYOND * found.spread, noise)
@@ -276,7 +278,7 @@ def find_regions(
         told = region & (found.seen >= _LEAST) & (found.amount >= _TELLS)
         if (_is_large(told, strong)
                 and np.median(ratio[told]) >= agreed
-                and np.quantile(found.amount[told], 0.9) >= _CLEAR
+                and np.quantile(found.amount[told], 0.9) >= clear
                 and np.median(found.seen[told]) >= _WITNESSES):
             reach = round(_REACH * max(region.shape))
             result |= region & (cv2.dilate((told & strong).astype(np.uint8), _disc(reach)) > 0)
@@ -311,7 +313,7 @@ def _common(
     for index in others:
         other = views[index]
         visible = where[_sees(other, where)]
-        column, line, _ = _project(other.camera, visible)
+        column, line, _ = project(other.camera, visible)
         seen += len(visible)
         inside += int(regions[index][np.rint(line).astype(int), np.rint(column).astype(int)].sum())
     return inside / max(1, seen)

@@ -19,7 +19,7 @@ from recon_cli.io.images import fill_masked, reduce_view
 from recon_cli.io.views import evenly_spread
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
-from recon_cli.train.moving import SIDE, SURE, compare_view, find_moving
+from recon_cli.train.moving import SIDE, SURE, ComparedView, compare_view, find_moving
 
 FINER = 2  # times as large are the images of the last round as those of the first
 _FIRST_LOOK = 60  # views, evenly spread
@@ -52,16 +52,24 @@ class Judge:
         agreed: float = _LIKELY,
     ) -> Regions:
         """Returns where each view shows what moves, at its size reduced to `side` pixels."""
-        return find_moving([
-            compare_view(splats, view, self.sh_degree, self.backend, side=side)
-            for view in views], agreed=agreed)
+        return find_moving(self.compare(splats, views, side), agreed=agreed)
+
+    def compare(
+        self, splats: Splats, views: Sequence[TrainView], side: int = SIDE
+    ) -> list[ComparedView]:
+        """Returns views, reduced to `side` pixels, beside their renders."""
+        return [compare_view(splats, view, self.sh_degree, self.backend, side=side)
+                for view in views]
 
 
-def find_signs(splats: Splats, views: Sequence[TrainView], judge: Judge) -> NDArray[np.bool_]:
-    """Returns which of some views, evenly spread, surely show something that moves."""
-    rows = np.unique(np.linspace(0, len(views) - 1, _FIRST_LOOK).round().astype(int))
-    regions = judge.regions(splats, [views[row] for row in rows], agreed=SURE)
-    return np.array([region.any() for region in regions])
+def first_look(count: int) -> NDArray[np.int64]:
+    """Returns which of `count` views are looked at first, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, _FIRST_LOOK).round().astype(np.int64))
+
+
+def find_signs(compared: Sequence[ComparedView]) -> NDArray[np.bool_]:
+    """Returns which of some views surely show something that moves."""
+    return np.array([region.any() for region in find_moving(compared, agreed=SURE)])
 
 
 def are_enough(signs: NDArray[np.bool_]) -> bool:
@@ -100,11 +108,16 @@ def find_in_held_out(
     splats: Splats, held_out: Sequence[TrainView], training: Sequence[TrainView], judge: Judge
 ) -> Regions:
     """Returns where held-out views contradict those that a model was trained on, [H, W] each."""
-    compared, witnesses = ([
-        compare_view(splats, view, judge.sh_degree, judge.backend, side=FINER * SIDE)
-        for view in views] for views in (held_out, evenly_spread(training, _FIRST_LOOK)))
+    compared, witnesses = (judge.compare(splats, views, FINER * SIDE)
+                           for views in (held_out, evenly_spread(training, _FIRST_LOOK)))
     return [enlarge(region, view.camera.width, view.camera.height)
             for region, view in zip(find_moving(compared, witnesses), held_out, strict=True)]
+
+
+def join(first: Regions, second: Regions) -> Regions:
+    """Returns the regions of each view in either, at the size in `second`."""
+    return [enlarge(one, other.shape[1], other.shape[0]) | other
+            for one, other in zip(first, second, strict=True)]
 
 
 def share_of(regions: Sequence[NDArray[np.bool_]]) -> float:

@@ -288,7 +288,8 @@ def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool
     changed = config.images == "auto" and any(
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
     needs = examine(TrialScene(
-        task, scene.points, scene.colors, twins if changed else None, harmonics))
+        task, scene.points, scene.colors, twins if changed else None, harmonics,
+        tuple(view.name for view in (*scene.train, *scene.validation))))
     for decision in needs.decisions:
         logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
     return needs
