@@ -9,7 +9,7 @@ DEV := $(VENV)/.dev
 HEAVY := integration or browser or compile or slow
 WORKERS ?= 2
 ON_ALL := -n $(WORKERS) --dist worksteal
-PYTEST := $(BIN)/python -m pytest -q -rs $(ON_ALL)
+PYTEST := $(BIN)/python -m pytest -q -rs --durations 20 $(ON_ALL)
 
 # The lowest versions that pyproject.toml allows, on the oldest Python that it allows.
 OLDEST ?= python3.11
