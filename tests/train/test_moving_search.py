@@ -9,7 +9,8 @@ from wall_scene import CONFIG, scene
 from recon_cli.train.feature_trials import examine
 from recon_cli.train.moving_search import are_enough, enlarge, hide, is_plausible, share_of
 
-PARTS = {"far": "off", "stereo": "off", "exposure": "off", "iterations": 1000}
+PARTS = {
+    "far": "off", "stereo": "off", "exposure": "off", "vignette": "off", "iterations": 1000}
 
 
 def carried(views, *, size=(50, 26), every=1):
