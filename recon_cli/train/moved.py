@@ -73,8 +73,9 @@ class Space:
                                  for view, pixels in zip(views, seen, strict=True)])
         depth = float(np.median(np.concatenate([view.depth[view.depth > 0] for view in views])))
         low, high = np.percentile(points, [1, 99], axis=0)
-        side = max(_CELL * depth, float(np.prod(np.maximum(high - low, 1e-9)) / _MOST_CELLS)
-                   ** (1 / 3))
+        side = _CELL * depth
+        while np.prod(np.maximum((high - low) / side, 1)) > _MOST_CELLS:
+            side *= 1.1
         axes = [np.arange(a + side / 2, max(b, a + side), side)
                 for a, b in zip(low, high, strict=True)]
         cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -161,6 +162,8 @@ def was_moved(views: Sequence[ComparedView]) -> bool:
     last often agree with each other, too, and see it from different sides.
     """
     if noise_level(views) > TOO_NOISY or not is_walk([view.camera for view in views]):
+        return False
+    if not any((view.depth > 0).any() for view in views):
         return False
     parts, space = Parts.halves(views), Space.of_views(views)
     regions = parts.contradictions()

@@ -8,7 +8,7 @@ from wall_scene import scene
 
 from recon_cli.scene.camera import Camera
 from recon_cli.train.feature_trials import examine
-from recon_cli.train.moved import Parts, hide_rarer, is_walk, was_moved
+from recon_cli.train.moved import Parts, Space, hide_rarer, is_walk, was_moved
 from recon_cli.train.moving import ComparedView
 from recon_cli.train.moving_search import enlarge
 
@@ -51,6 +51,18 @@ def test_what_one_half_shows_was_moved(rows):
 
 def test_nothing_was_moved_where_views_agree():
     assert not was_moved(views())
+
+
+def test_a_model_without_surface_was_not_moved():
+    some = stand(views(), FIRST)
+    assert not was_moved([replace(view, depth=np.zeros((H, W), np.float32)) for view in some])
+
+
+def test_a_long_and_narrow_space_has_no_more_cells_than_others():
+    some = [replace(view, depth=np.full((H, W), 0.05, np.float32)) for view in views()]
+    for row, view in enumerate(some):
+        view.camera.viewmat[0, 3] = -50.0 * row
+    assert len(Space.of_views(some).cells) <= 500_000
 
 
 def test_an_error_that_all_views_have_on_a_surface_was_not_moved():
