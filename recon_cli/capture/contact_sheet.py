@@ -142,11 +142,24 @@ def _encode(canvas: Image.Image) -> bytes:
     for colours in PALETTES:
         stored = io.BytesIO()
         canvas.quantize(
-            colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE,
-        ).save(stored, "PNG", optimize=True)
+            palette=_choose_palette(canvas, colours), dither=Image.Dither.NONE).save(stored, "PNG")
         if stored.tell() <= MAX_BYTES:
             break
     return stored.getvalue()
+
+
+def _choose_palette(canvas: Image.Image, colours: int) -> Image.Image:
+    """Returns a palette of the sheet's own colours and of those that its pictures need.
+
+    An octree finds them in a tenth of the time of a median cut, and neither keeps the colour of a
+    border that is rare.
+    """
+    own = dict.fromkeys((PAPER, INK, FAINT, *COLOURS.values()))
+    found = canvas.quantize(
+        colours - len(own), method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([value for colour in own for value in colour] + (found.getpalette() or []))
+    return palette
 
 
 def _thumbnail(rgb: NDArray[np.uint8], size: tuple[int, int]) -> Image.Image:
