@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from syntax import FILES, PACKAGE, dotted, nodes
+
 from recon_cli.stages import STAGES
 
-PACKAGE = Path(__file__).resolve().parents[1] / "recon_cli"
-FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 500
 
 # Each part of the package (a module or folder at its top) and the parts that it may import.
@@ -77,11 +77,6 @@ HOMES = {
 }
 
 
-@cache
-def tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
 def part(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
@@ -90,13 +85,12 @@ def part(path: Path) -> str:
 def imports(path: Path) -> tuple[str, ...]:
     """Returns the dotted name of every import of a file, late ones as well."""
     names: list[str] = []
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path} imports relatively"
-            assert node.module
-            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    for node in nodes(path, ast.Import):
+        names += [alias.name for alias in node.names]
+    for late in nodes(path, ast.ImportFrom):
+        assert late.level == 0, f"{path} imports relatively"
+        assert late.module
+        names += [f"{late.module}.{alias.name}" for alias in late.names]
     return tuple(names)
 
 
@@ -148,29 +142,28 @@ def test_a_file_is_not_longer_than_a_reader_can_hold() -> None:
 
 def test_nothing_below_the_command_line_prints_or_exits() -> None:
     for path in FILES:
-        for node in ast.walk(tree(path)):
-            if isinstance(node, ast.Call):
-                called = ast.unparse(node.func)
-                assert called not in {"print", "exit", "quit", "sys.exit", "os.system"}, path
-                assert not any(word.arg == "shell" for word in node.keywords), f"shell in {path}"
-            if isinstance(node, ast.Raise) and node.exc and path.name != "__main__.py":
-                assert "SystemExit" not in ast.unparse(node.exc), path
+        for call in nodes(path, ast.Call):
+            called = dotted(call.func)
+            assert called not in {"print", "exit", "quit", "sys.exit", "os.system"}, path
+            assert not any(word.arg == "shell" for word in call.keywords), f"shell in {path}"
+        for error in nodes(path, ast.Raise):
+            if error.exc and path.name != "__main__.py":
+                assert "SystemExit" not in ast.unparse(error.exc), path
 
 
 def test_files_are_opened_by_python_and_not_by_opencv() -> None:
     # which crashes on a path that is not UTF-8, and says nothing where a file cannot be written
+    refused = {f"cv2.{name}" for name in ("imread", "imreadmulti", "imwrite", "imwritemulti",
+                                          "VideoCapture", "VideoWriter", "FileStorage")}
     for path in FILES:
-        for node in ast.walk(tree(path)):
-            if isinstance(node, ast.Attribute):
-                assert ast.unparse(node) not in {
-                    f"cv2.{name}" for name in ("imread", "imreadmulti", "imwrite", "imwritemulti",
-                                               "VideoCapture", "VideoWriter", "FileStorage")}, path
+        for node in nodes(path, ast.Attribute):
+            assert dotted(node) not in refused, path
 
 
 def test_only_what_a_table_names_is_imported_by_name() -> None:
     # elsewhere an import is a statement, which type checkers and readers see
-    found = {path.relative_to(PACKAGE).as_posix() for path in FILES for node in ast.walk(tree(path))
-             if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module")}
+    found = {path.relative_to(PACKAGE).as_posix() for path in FILES
+             for call in nodes(path, ast.Call) if dotted(call.func).endswith("import_module")}
     # public names, commands, stages, and formats of Gaussians
     assert found == {"__init__.py", "api/__init__.py", "cli.py", "pipeline/execute.py",
                      "splats/registry.py"}

@@ -19,8 +19,8 @@ from pathlib import Path
 import pytest
 import torch
 from scenes import random_splats
+from syntax import FILES, PACKAGE, dotted, nodes
 
-import recon_cli
 from recon_cli import processes, signals
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError, ExitCode
@@ -29,7 +29,6 @@ from recon_cli.train.state import load_state, new_state, save_state
 from recon_cli.viewer import server
 from recon_cli.workspace import atomic, disk, durable, journal, layout
 
-PACKAGE = Path(recon_cli.__file__).parent
 ROOT = PACKAGE.parent
 # Names that Windows keeps for devices, whatever suffix they have.
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
@@ -48,9 +47,10 @@ POSIX_MODULES = {"fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "sy
 FLAGS = os.O_RDWR | os.O_WRONLY
 
 
-def trees():
-    for path in PACKAGE.rglob("*.py"):
-        yield path.relative_to(PACKAGE).as_posix(), ast.parse(path.read_text(encoding="utf-8"))
+def all_nodes(kind):
+    for path in FILES:
+        for node in nodes(path, kind):
+            yield path.relative_to(PACKAGE).as_posix(), node
 
 
 @pytest.fixture
@@ -76,34 +76,31 @@ def on_windows(monkeypatch):
 
 
 def test_what_only_posix_has_is_asked_for_before_it_is_used():
-    found = {(name, where) for where, tree in trees() for node in ast.walk(tree)
-             if isinstance(node, ast.Attribute) and MISSING.fullmatch(name := ast.unparse(node))}
+    found = {(name, where) for where, node in all_nodes(ast.Attribute)
+             if MISSING.fullmatch(name := dotted(node))}
     assert found == set(POSIX_ONLY.items())
     for _, where in found:
         assert "hasattr(" in (PACKAGE / where).read_text(encoding="utf-8")
 
 
 def test_no_module_of_posix_alone_is_imported():
-    for where, tree in trees():
-        for node in ast.walk(tree):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [
-                node.module] if isinstance(node, ast.ImportFrom) else []
-            assert not POSIX_MODULES & set(names), where
+    for where, node in all_nodes(ast.Import):
+        assert not POSIX_MODULES & {alias.name for alias in node.names}, where
+    for where, node in all_nodes(ast.ImportFrom):
+        assert node.module not in POSIX_MODULES, where
 
 
 def test_text_is_read_and_written_as_utf8_whatever_the_system_prefers():
-    for where, tree in trees():
-        for node in ast.walk(tree):
-            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
-                continue
-            words = {word.arg for word in node.keywords}
-            mode = next(
-                (each.value for each in node.args[:1] if isinstance(each, ast.Constant)), "r")
-            text = node.func.attr in ("read_text", "write_text") or (
-                node.func.attr == "open" and isinstance(mode, str) and "b" not in mode
-                and ast.unparse(node.func.value).endswith(("path", "file", "log")))
-            own = ast.unparse(node.func.value) == "atomic"  # which knows nothing else
-            assert not text or own or "encoding" in words, f"{where}:{node.lineno}"
+    for where, node in all_nodes(ast.Call):
+        if not isinstance(node.func, ast.Attribute):
+            continue
+        words = {word.arg for word in node.keywords}
+        mode = next((each.value for each in node.args[:1] if isinstance(each, ast.Constant)), "r")
+        text = node.func.attr in ("read_text", "write_text") or (
+            node.func.attr == "open" and isinstance(mode, str) and "b" not in mode
+            and dotted(node.func.value).endswith(("path", "file", "log")))
+        own = dotted(node.func.value) == "atomic"  # which knows nothing else
+        assert not text or own or "encoding" in words, f"{where}:{node.lineno}"
 
 
 def test_names_of_files_differ_by_more_than_case_and_can_be_made_on_windows():
@@ -217,8 +214,8 @@ def reload_with(module, monkeypatch, missing=(), **more):
     """A copy of a module as it is where a system lacks some names and has others."""
     for owner, name in missing:
         monkeypatch.delattr(owner, name)
-    for dotted, value in more.items():
-        owner, _, name = dotted.partition("__")
+    for words, value in more.items():
+        owner, _, name = words.partition("__")
         monkeypatch.setattr(sys.modules[owner], name, value, raising=False)
     spec = importlib.util.spec_from_file_location(f"{module.__name__}_elsewhere", module.__file__)
     copy = importlib.util.module_from_spec(spec)
