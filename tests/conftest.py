@@ -72,6 +72,14 @@ def _own_threads(_initial_threads: int | None) -> Iterator[None]:
         sys.modules["torch"].set_num_threads(_initial_threads)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _unflushed() -> Iterator[None]:
+    """Lets no test wait for the disk: none cuts the power. What is closed is still refused."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: os.fstat(file) and None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def build_once(
     tmp_path_factory: pytest.TempPathFactory

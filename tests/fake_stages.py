@@ -60,7 +60,8 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
         if not path.exists():
             write_bytes(path, f"{step} of {name}".encode())
             ctx.record(step, STEPS)
-            time.sleep(float(os.environ.get(f"SLOW_{name.upper()}", "0")))
+            if seconds := os.environ.get(f"SLOW_{name.upper()}"):
+                time.sleep(float(seconds))
     options = {key: value for key, value in config.hashed_fields().items() if key != "seed"}
     read = [(path / "result.txt").read_text() for path in inputs.folders.values()]
     read += [path.read_text() for path in inputs.sources if path.is_file()]

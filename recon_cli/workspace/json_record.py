@@ -11,6 +11,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -78,7 +79,7 @@ def _encode(item: Any) -> Any:
 def _decode_fields(kind: type, value: Any) -> Any:
     if not isinstance(value, Mapping):
         raise ManifestError("the record is not a JSON object", hint=_HINT)
-    kinds, fields = typing.get_type_hints(kind), dataclasses.fields(kind)
+    kinds, fields = _type_hints(kind), dataclasses.fields(kind)
     missing = [
         _key(field) for field in fields if _key(field) not in value
         and field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING]
@@ -92,6 +93,11 @@ def _decode_fields(kind: type, value: Any) -> Any:
         return kind(**items)
     except ValueError as error:  # of a class that checks its fields
         raise ManifestError(f"the record cannot be used: {error}", hint=_HINT) from error
+
+
+@cache  # else they are read anew for each record, which takes most of the time
+def _type_hints(kind: Any) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
 
 
 def _decode(name: str, kind: Any, item: Any) -> Any:
