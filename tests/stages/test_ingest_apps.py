@@ -18,12 +18,13 @@ PICTURE = 12  # of 255, mean: JPEG and H.264 of small pictures; the wrong pictur
 
 @pytest.fixture(scope="session")
 def frames(shared_data):
-    return shots(shared_data / "rooms" / "office")
+    """Shots of which each has intrinsics of its own."""
+    return shots(shared_data / "rooms" / "office", count=3)
 
 
 @pytest.fixture(scope="session")
 def still(shared_data):
-    return shots(shared_data / "rooms" / "office", moving=False)
+    return shots(shared_data / "rooms" / "office", count=3, moving=False)
 
 
 def best_shot(pixels, taken):
@@ -101,7 +102,8 @@ def test_a_packed_recording_gives_what_the_folder_gives(frames, tmp_path):
             assert (out / "depth" / path.name).read_bytes() == path.read_bytes()
 
 
-def test_fewer_frames_of_a_video_are_still_those_of_their_rows(frames, tmp_path):
+def test_fewer_frames_of_a_video_are_still_those_of_their_rows(shared_data, tmp_path):
+    frames = shots(shared_data / "rooms" / "office")
     stray(tmp_path / "walk", frames, between=1)
     take(tmp_path / "walk", tmp_path / "out", config=IngestConfig(frames=4))
     poses = read_poses(tmp_path / "out" / POSES)
