@@ -43,7 +43,7 @@ def repeat(frames, pattern):
 @pytest.mark.parametrize(("codec", "options"), [
     ("libx264", {"crf": "18"}), ("libx264", {"crf": "26"}), ("mpeg4", {"qmin": "5", "qmax": "5"})])
 def test_repeats_of_a_walk_are_found_in_any_codec(tmp_path, codec, options, pattern):
-    frames, numbers = repeat(pan(2, 12, noise=2), pattern)
+    frames, numbers = repeat(pan(2, 8, noise=2), pattern)
     path = write_video(tmp_path / "a.mp4", frames, codec=codec, options=options)
     np.testing.assert_array_equal(stills_of(path), numbers)
 
