@@ -19,13 +19,13 @@ def room(tmp_path_factory):
     make_replica(base / "room2", frames=8, tests=2)
     for path in (base / "room2" / "test" / "results").glob("*.jpg"):
         ImageOps.invert(Image.open(path)).save(path)
-    options = ["--iterations", "40", "--max-gaussians", "200", "--validation", "0.2"]
+    options = ["--iterations", "12", "--max-gaussians", "200", "--validation", "0.2"]
     for name, capture in (("a", "room"), ("other", "room2")):
         assert main(["ingest", str(base / capture), "-w", str(base / name)]) == 0
         assert main(["train", "-w", str(base / name), *options]) == 0
     shutil.copytree(base / "a", base / "b")
     assert main(["train", "-w", str(base / "b"), *options, "--seed", "1"]) == 0
-    assert main(["prune", "-w", str(base / "a"), "--recovery", "4"]) == 0
+    assert main(["prune", "-w", str(base / "a"), "--recovery", "2"]) == 0
     return base
 
 

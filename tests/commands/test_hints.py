@@ -58,13 +58,15 @@ def commands_in_messages() -> list[tuple[str, bool, str, str]]:
     """Returns (place, is in a hint, verb, words) of every command in backticks in the package."""
     found = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        hints = {id(inner) for node in ast.walk(tree) if isinstance(node, ast.keyword)
+        text = path.read_text(encoding="utf-8")
+        if "recon " not in text:
+            continue
+        nodes = [*ast.walk(ast.parse(text))]
+        hints = {id(inner) for node in nodes if isinstance(node, ast.keyword)
                  and node.arg == "hint" for inner in ast.walk(node.value)}
-        for node in ast.walk(tree):
-            place = f"{path.relative_to(PACKAGE)}:{getattr(node, 'lineno', 0)}"
-            found += [(place, id(node) in hints, *match.groups())
-                      for match in COMMAND.finditer(_text(node))]
+        for node in nodes:
+            found += [(f"{path.relative_to(PACKAGE)}:{node.lineno}", id(node) in hints,
+                       *match.groups()) for match in COMMAND.finditer(_text(node))]
     return found
 
 

@@ -58,6 +58,7 @@ class MadeModel:
     unregistered: frozenset[int] = frozenset()
     hidden: dict[int, NDArray[np.int64]] = field(default_factory=dict)
     reach: int = 10**9
+    _views: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -102,7 +103,12 @@ class MadeModel:
         return model
 
     def _seen(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Returns which points an image sees, and where."""
+        """Returns which points an image sees, and where; projected once for all of its pairs."""
+        if index not in self._views:
+            self._views[index] = self._project(index)
+        return self._views[index]
+
+    def _project(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         local = self.poses[index] * self.points
         places = FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]
         inside = (local[:, 2] > 0) & (places >= 0).all(axis=1) & (
@@ -113,7 +119,8 @@ class MadeModel:
     def _write_pair(self, opened: pycolmap.Database, first: int, second: int) -> None:
         looks = np.arange(len(self.points)) if self.looks is None else self.looks
         _, one, two = np.intersect1d(
-            looks[self._seen(first)[0]], looks[self._seen(second)[0]], return_indices=True)
+            looks[self._seen(first)[0]], looks[self._seen(second)[0]], return_indices=True,
+            assume_unique=self.looks is None)
         matches = np.column_stack([one, two]).astype(np.uint32)
         opened.write_matches(first + 1, second + 1, matches)
         if len(matches) < 15:  # as COLMAP's verification would
@@ -128,15 +135,16 @@ def _camera() -> pycolmap.Camera:
         params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
 
 
-def walk(**changes) -> MadeModel:
+def walk(count: int = 1200, **changes) -> MadeModel:
     """Sixteen cameras half a metre apart along a wall; neighbours see much in common."""
-    return MadeModel(wall(-4, 12, count=2400), along(np.arange(16) * 0.5), **changes)
+    return MadeModel(wall(-4, 12, count=count), along(np.arange(16) * 0.5), **changes)
 
 
-def broken_walk(at: int = 8) -> MadeModel:
+def broken_walk(at: int = 8, count: int = 1200) -> MadeModel:
     """The cameras from `at` on are turned and shifted with all that they see but a few points."""
     motion = moved(1, 2, 0, degrees=20)
     return walk(
+        count,
         motions=dict.fromkeys(range(at, 16), motion),
         landmark=lambda image, point: point if point < 60 else (image >= at, point))
 

@@ -13,7 +13,7 @@ from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import fallbacks, keyframes, mapper, parts, skeleton
+from recon_cli.sfm import fallbacks, keyframes, mapper, parts, skeleton, wide_lens
 from recon_cli.sfm.fallbacks import (
     MapperAttempt,
     best_attempt,
@@ -36,8 +36,14 @@ def build(job, deadline=math.inf):
 
 @pytest.fixture
 def capture(tmp_path):
-    """Twenty cameras around 300 points, all of them matched."""
-    return make_capture(tmp_path)
+    """Twenty cameras around points, all of them matched; too few points to try other lenses on."""
+    return make_capture(tmp_path, points=150)
+
+
+@pytest.fixture
+def few_pairs(monkeypatch):
+    """Lets four pairs of images say whether a lens is a fisheye."""
+    monkeypatch.setattr(wide_lens, "_PAIRS", 4)
 
 
 def sized(job, count):
@@ -196,8 +202,8 @@ def test_where_no_mapper_found_a_model_none_is_best():
     assert best_attempt([MapperAttempt("exhaustive", ""), MapperAttempt("relaxed", "")]) is None
 
 
-def test_a_good_capture_stops_at_the_first_attempt(capture):
-    job, truth = capture
+def test_a_good_capture_stops_at_the_first_attempt(tmp_path):
+    job, truth = make_capture(tmp_path)  # with points enough to try other lenses on
     result = build(job)
     attempt, = result.attempts
     assert attempt.name == "exhaustive"
@@ -218,6 +224,7 @@ def nothing(*_, **__):
     return []
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
@@ -228,6 +235,7 @@ def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     assert [item.reason for item in result.attempts[1:]] == ["no model was found"] * 2
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
@@ -240,6 +248,7 @@ def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
     assert_facts(told[0], "another mapper", "minutes more", "no model was found")
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypatch):
     job, truth = capture
     monkeypatch.setattr(mapper, "map_incrementally", lambda *_: [
@@ -252,6 +261,7 @@ def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypa
     assert sorted(path.name for path in job.parts.iterdir()) == ["1", "2"]
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
@@ -263,6 +273,7 @@ def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     assert not (job.model).exists()
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "the model cannot be trusted")
@@ -271,6 +282,7 @@ def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     assert result.parts[0].registered == job.names
 
 
+@pytest.mark.usefixtures("few_pairs")
 def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, monkeypatch):
     job, _ = capture
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
@@ -286,6 +298,7 @@ def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, m
     assert result.attempts[2].kept
 
 
+@pytest.mark.usefixtures("few_pairs")
 @pytest.mark.parametrize("place", [
     "match", "publish",
     *(pytest.param(place, marks=pytest.mark.slow)

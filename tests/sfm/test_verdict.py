@@ -104,11 +104,11 @@ def test_two_places_laid_over_each_other_are_found_though_every_match_agrees(tmp
 
 def test_places_that_look_alike_do_not_speak_against_a_right_model(tmp_path):
     """The posters' matches outnumber those that tie the middle of a walk and all contradict it."""
-    points = np.concatenate([wall(-4, 24, count=1600), wall(-1, 1, count=1600, seed=1)])
+    points = np.concatenate([wall(-4, 24, count=800), wall(-1, 1, count=800, seed=1)])
     away = np.array([20.0, 1, 0])  # higher up too: else it lies on the epipolar lines
-    points = np.concatenate([points, points[1600:] + away])
+    points = np.concatenate([points, points[800:] + away])
     looks = np.arange(len(points))
-    looks[3200:] = looks[1600:3200]
+    looks[1600:] = looks[800:1600]
     made = MadeModel(points, along(np.arange(51) * 0.4), looks=looks)
     model, database = made.model(), made.write_database(tmp_path / "database.db")
     evidence = gather_evidence(model, database, made.names)

@@ -1,12 +1,19 @@
 """Inputs of sfm, made on the spot, and frames that defeat it."""
 
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import av
 import cv2
 import numpy as np
+import pytest
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io.images import write_png
+from recon_cli.sfm import process, worker
+from recon_cli.sfm.job import Reporter
 from recon_cli.stages import sfm
 from recon_cli.workspace.records import Frame, FrameList, Group
 
@@ -43,6 +50,20 @@ def run(base, out, *, ctx=None, **options):
     out.mkdir(exist_ok=True)
     inputs = StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"})
     return sfm.run(SfmConfig(**options), inputs, out, ctx or StageContext(threads=2))
+
+
+@contextmanager
+def mapping_here() -> Iterator[None]:
+    """Maps in this process: to start another one takes longer than a small capture does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(process, "run_job", lambda job, **_: worker.work(job, Reporter(io.BytesIO())))
+        yield
+
+
+def run_here(base, out, *, ctx=None, **options):
+    """Does as `run` in this process; nothing is told while the capture is mapped."""
+    with mapping_here():
+        return run(base, out, ctx=ctx, **options)
 
 
 def texture(height, width, seed):

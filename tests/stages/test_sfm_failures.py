@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import summaries
 from facts import assert_facts
-from sfm_inputs import run, texture, turning, write_inputs
+from sfm_inputs import run, run_here, texture, turning, write_inputs
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
@@ -34,7 +34,7 @@ def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
 def test_a_camera_that_turns_on_the_spot_is_not_taken_for_a_success(tmp_path, pairs, count):
     out = tmp_path / "out"
     with pytest.raises(SfmError, match="The camera did not move"):
-        run(write_inputs(tmp_path, turning(12)), out, pairs=pairs, max_minutes=1.0)
+        run_here(write_inputs(tmp_path, turning(12)), out, pairs=pairs, max_minutes=1.0)
     assert not (out / "sparse").exists()
     assert database.progress(out / "database.db", "matches") == count
 
@@ -86,7 +86,7 @@ def test_what_is_short_or_not_known_is_not_told(tmp_path, monkeypatch, changes):
 def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):
     images = {f"{seed}.png": texture(180, 240, seed) for seed in range(4)}
     with pytest.raises(SfmError, match="No two frames match"):
-        run(write_inputs(tmp_path, images), tmp_path / "out", max_minutes=1.0)
+        run_here(write_inputs(tmp_path, images), tmp_path / "out", max_minutes=1.0)
 
 
 def test_a_missing_twin_is_found_before_anything_is_done(tmp_path):

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sfm_inputs import every_nth, run, texture, write_inputs
+from sfm_inputs import every_nth, run, run_here, texture, write_inputs
 
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images, read_points, read_scene
@@ -79,7 +79,7 @@ def test_poses_and_points_that_are_kept_are_written_as_they_were_given(
 @pytest.mark.integration
 def test_kept_poses_are_held_against_some_of_the_images(room, truth, given, tmp_path):
     given(truth, np.random.default_rng(0).normal(size=(50, 3)))
-    line, = run(room, tmp_path / "out").lines
+    line, = run_here(room, tmp_path / "out").lines
     share, matches = re.match(r"(\d+)% of (\d+) matches between sampled images", line).groups()
     assert int(share) > 80
     assert int(matches) > 500
@@ -96,7 +96,7 @@ def test_wrong_poses_are_refused_although_points_came_with_them(
         wrong = dict(zip(names, [truth[name] for name in [*names[4:], *names[:4]]], strict=True))
     given(wrong, np.random.default_rng(0).normal(size=(50, 3)))
     with pytest.raises(SfmError, match="The given poses do not fit the images"):
-        run(room, tmp_path / "out")
+        run_here(room, tmp_path / "out")
     assert not (tmp_path / "out" / "sparse").exists()
 
 
@@ -106,7 +106,7 @@ def test_a_known_distance_scales_cameras_points_and_what_is_undistorted(
 ):
     given(truth, np.random.default_rng(0).normal(size=(50, 3)))
     first, last = "000000.png", "000016.png"
-    summary = run(room, tmp_path / "out", scale_between=(first, "000016", 5.0))
+    summary = run_here(room, tmp_path / "out", scale_between=(first, "000016", 5.0))
     for folder in ("sparse", "undistorted/sparse"):
         centers = {name: np.linalg.inv(viewmat)[:3, 3] for name, _, viewmat in read_images(
             tmp_path / "out" / folder / "images.bin")}
@@ -124,13 +124,13 @@ def test_a_place_that_does_not_exist_is_told_before_anything_is_mapped(
 ):
     given(truth)
     with pytest.raises(ConfigError, match=r"000017\.png"):
-        run(room, tmp_path / "out", scale_between=("000000.png", "000017.png", 5.0))
+        run_here(room, tmp_path / "out", scale_between=("000000.png", "000017.png", 5.0))
     assert not list((tmp_path / "out").iterdir())
 
 
 def test_points_are_triangulated_from_poses_that_stay_where_they_are(room, truth, given, tmp_path):
     given({name: viewmat for name, viewmat in truth.items() if name != POSELESS})
-    summary = run(room, tmp_path / "out")
+    summary = run_here(room, tmp_path / "out")
     poses = found(tmp_path / "out")
     assert summary.unregistered == (POSELESS,)
     assert summary.poses == PosesSummary(use="keep", metric=True)
@@ -147,7 +147,7 @@ def test_points_are_triangulated_from_poses_that_stay_where_they_are(room, truth
 def test_refined_poses_come_nearer_to_the_truth_and_keep_its_unit(room, truth, given, tmp_path):
     noise = np.random.default_rng(0)
     given({name: shaken(viewmat, noise) for name, viewmat in truth.items()})
-    summary = run(room, tmp_path / "out", poses="refine")
+    summary = run_here(room, tmp_path / "out", poses="refine")
     # Steps between frames do not depend on where the whole was moved to: they were given with an
     # error of 2 cm and more, over a path of some 2 m.
     np.testing.assert_allclose(steps(found(tmp_path / "out")), steps(truth), rtol=0.05)
@@ -182,7 +182,7 @@ def test_poses_that_have_nothing_to_do_with_the_images_are_refused(room, truth, 
     """Every camera looks backwards, as with the axes of another convention."""
     given({name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()})
     with pytest.raises(SfmError) as caught:
-        run(room, tmp_path / "out")
+        run_here(room, tmp_path / "out")
     assert "do not fit the images" in caught.value.message
     assert "--poses ignore" in caught.value.hint
 
@@ -191,7 +191,7 @@ def test_poses_that_have_nothing_to_do_with_the_images_are_refused(room, truth, 
 def test_two_posed_frames_are_too_few(room, truth, given, tmp_path):
     given(dict(list(truth.items())[:2]))
     with pytest.raises(SfmError, match="Only 2 of 9 frames have a camera"):
-        run(room, tmp_path / "out")
+        run_here(room, tmp_path / "out")
 
 
 def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(tmp_path):
@@ -214,7 +214,7 @@ def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(t
     viewmats[:, 0, 3] = range(3)
     KnownPoses(dict(zip(images, viewmats, strict=True)), True, np.ones((4, 3)),
                np.zeros((4, 3), np.uint8)).write(base / "ingest")
-    summary = run(base, tmp_path / "out")
+    summary = run_here(base, tmp_path / "out")
     assert [camera["frames"] for camera in summary.cameras] == [2, 1]
     undistorted = tmp_path / "out" / "undistorted"
     for name, camera in (("1.png", 0), ("2.png", 1)):
@@ -233,7 +233,7 @@ def test_frames_of_two_cameras_and_their_masks_are_undistorted_each_by_its_own(t
 def test_tracked_poses_are_refined_and_give_metres_and_up(room, truth, given, tmp_path):
     noise = np.random.default_rng(0)
     given({name: shaken(viewmat, noise) for name, viewmat in truth.items()}, tracked=True)
-    summary = run(room, tmp_path / "out")
+    summary = run_here(room, tmp_path / "out")
     assert summary.poses.use == "auto"
     assert summary.poses.held == 0
     assert summary.world.evidence.metres
@@ -245,7 +245,7 @@ def test_tracked_poses_are_refined_and_give_metres_and_up(room, truth, given, tm
 def test_tracked_poses_of_another_capture_are_not_used(room, truth, given, tmp_path):
     given({name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()},
           tracked=True)
-    summary = run(room, tmp_path / "out", min_registered=0.3)
+    summary = run_here(room, tmp_path / "out", min_registered=0.3)
     assert summary.poses.use == "refuted"
     assert not summary.world.evidence.metres
     assert any("from the pictures alone" in line for line in summary.lines)

@@ -1,6 +1,7 @@
 """When a run that has flattened skips to its final phase, and that a resumed one does too."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 from tiny_task import CONFIG, STRATEGIES, Hooks, first_state, same, saved_and_loaded, tiny_task
@@ -77,11 +78,18 @@ def test_the_steps_between_are_not_taken_and_the_final_phase_is(config):
     assert state.optimizer.count == 50
 
 
+@cache
+def whole_run():
+    """The state after a run that was not interrupted; `flat` must be in force."""
+    state = first_state()
+    run(state, tiny_task())
+    return state
+
+
 @pytest.mark.usefixtures("flat")
 @pytest.mark.parametrize("stop", [17, 37, 38, 50])
 def test_a_resumed_run_jumps_at_the_same_step_to_the_same_bits(tmp_path, stop):
-    whole, part = first_state(), first_state()
-    run(whole, tiny_task())
+    whole, part = whole_run(), first_state()
     run(part, tiny_task(), stop)
     resumed = saved_and_loaded(part, tmp_path)
     run(resumed, tiny_task())
