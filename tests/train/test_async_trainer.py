@@ -42,7 +42,7 @@ def task_of(backend="triton", config=CONFIG):
     truth = random_splats(COUNT, seed=0, dtype=torch.float32)
     views = []
     for i in range(3):
-        camera = camera_at(20, 16, focal=(16.0, 25.0, 10.0)[i])
+        camera = camera_at(32, 16, focal=(24.0, 40.0, 16.0)[i])
         with torch.no_grad():
             rgb = render(truth, camera, torch.zeros(3), 0).rgb
         views.append(TrainView(camera, (rgb.clamp(0, 1) * 255).to(torch.uint8).numpy()))
