@@ -193,7 +193,7 @@ def test_the_process_fills_the_cache_that_the_stages_read(tmp_path):
     # all but two kernels, of the rasterizer and of stereo, and the mark that nothing is missing
     depths.compile_kernels()
     folder = copy_cache(tmp_path / "cache")
-    missing = [*folder.glob("*/optimizer.adam-*"), *folder.glob("*/kernels._penalties-*"),
+    missing = [*folder.glob("*/optimizer.adam-*"), *folder.glob("*/kernels.compare-*"),
                folder / "ready"]
     assert len(missing) == 5
     for path in missing:
