@@ -73,10 +73,9 @@ def brute_force(
 
 def _shades(means, coefficients, viewmat, degree):
     center = torch.linalg.inv(viewmat)[:3, 3]
-    return torch.stack([
-        (sh_basis((mean - center) / (mean - center).norm(), degree)
-         @ own[:(degree + 1) ** 2] + 0.5).clamp_min(0)
-        for mean, own in zip(means, coefficients, strict=True)])
+    towards = (means - center) / (means - center).norm(dim=1, keepdim=True)
+    used = coefficients[:, :(degree + 1) ** 2]
+    return ((sh_basis(towards, degree)[..., None] * used).sum(1) + 0.5).clamp_min(0)
 
 
 def _project(local, quats, scales, viewmat, K, width, height, eps2d):

@@ -180,7 +180,7 @@ def _truth(
         (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
         background.numpy().tobytes(), degree, margin)
     if key not in _truths:
-        if len(_truths) == 4:
+        if len(_truths) == 16:
             del _truths[next(iter(_truths))]
         _truths[key] = _compute_truth(splats, camera, background, degree, margin)
     return _truths[key]

@@ -71,7 +71,11 @@ def read_run(out: Path) -> Run:
 def damage_and_repair(folder: Path) -> None:
     """Runs a process that finds every file of the cache cut in half, and one after it."""
     cache_dir = folder / "cache"
-    _copy_damaged(cache_dir)
+    copy = copy_cache(cache_dir)
+    files = [*copy.rglob("*.nbc"), *copy.rglob("*.nbi")]
+    assert files
+    for path in files:
+        os.truncate(path, path.stat().st_size // 2)
     start(folder / "damaged", cache_dir)
     start(folder / "repaired", cache_dir)
 
@@ -81,14 +85,11 @@ def compile_for_avx2(folder: Path) -> None:
     start(folder / "avx2", folder / "cache", **HASWELL)
 
 
-def _copy_damaged(target: Path) -> None:
-    """Copies this process's own cache, so that nothing is compiled for it, and cuts the files."""
+def copy_cache(target: Path) -> Path:
+    """Copies this process's own cache, so that nothing is compiled for it, and returns the folder
+    of the kernels."""
     backend.warm_up()
     source = kernel.cache_folder()
     if source is None:
         pytest.skip("no folder for compiled kernels, see RECON_CACHE_DIR")
-    shutil.copytree(source, target / "kernels" / source.name)
-    files = [*target.rglob("*.nbc"), *target.rglob("*.nbi")]
-    assert files
-    for path in files:
-        os.truncate(path, path.stat().st_size // 2)
+    return Path(shutil.copytree(source, target / "kernels" / source.name))

@@ -74,6 +74,13 @@ def composited(
     R = torch.from_numpy(camera.viewmat[:3, :3])
     t = torch.from_numpy(camera.viewmat[:3, 3])
     local = splats.means @ R.T + t
+    order = torch.argsort(local[:, 2].detach(), stable=True)
+    order = order[local[order, 2] > NEAR]
+    means, covs = _project(local[order], _covariances(splats, order), R, camera)
+    inverses = torch.linalg.inv(covs)
+    # log sigmoid keeps its gradient where the sigmoid has rounded to 1
+    opacities = torch.nn.functional.logsigmoid(splats.logit_opacities[order]).exp()
+    colors, depths = _colors(splats, order, camera, sh_degree), local[order, 2]
     rows, columns = torch.meshgrid(
         torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     pixels = torch.stack([columns, rows], -1).double()
@@ -84,17 +91,11 @@ def composited(
     weights = torch.zeros_like(alphas)
     running = torch.ones(size, dtype=torch.bool)
     alpha_min, t_min = (ALPHA_MIN, TRANSMITTANCE_MIN) if thresholds else (0.0, 0.0)
-    for i in torch.argsort(local[:, 2].detach(), stable=True).tolist():
-        if local[i, 2] <= NEAR:
-            continue
-        mean, cov = _project(local[i], _covariance(splats, i), R, camera)
-        d = pixels - mean
+    for k, i in enumerate(order.tolist()):
+        d = pixels - means[k]
         if nudges is not None:
             d = d - nudges.means2d[i]
-        q = torch.einsum("hwi,ij,hwj->hw", d, torch.linalg.inv(cov), d)
-        # log sigmoid keeps its gradient where the sigmoid has rounded to 1
-        opacity = torch.nn.functional.logsigmoid(splats.logit_opacities[i]).exp()
-        alpha = opacity * torch.exp(-q / 2)
+        alpha = opacities[k] * torch.exp(-((d @ inverses[k]) * d).sum(-1) / 2)
         if nudges is not None:
             alpha = alpha * torch.exp(nudges.log_alphas[i])
         alpha = alpha.clamp_max(ALPHA_MAX)
@@ -108,90 +109,87 @@ def composited(
         alphas[i] = torch.where(part, alpha, 0.0).detach()
         weight = torch.where(part, alpha * left, 0.0)
         weights[i] = weight.detach()
-        rgb = rgb + weight[..., None] * color_towards(splats, i, camera, sh_degree)
-        depth = depth + weight * local[i, 2]
+        rgb = rgb + weight[..., None] * colors[k]
+        depth = depth + weight * depths[k]
         left = torch.where(part, left * (1 - alpha), left)
     return Composite(
         rgb + left[..., None] * background, 1 - left, depth, alphas, weights, margin.detach())
 
 
-def _covariance(splats: Splats, i: int) -> Tensor:
-    given = splats.quats[i].abs().max() > 1e-30  # zero stands for no rotation
-    quat = splats.quats[i] if given else torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
-    w, x, y, z = quat / quat.norm()
+def _covariances(splats: Splats, ids: Tensor) -> Tensor:
+    quats = splats.quats[ids]
+    given = quats.abs().amax(1, keepdim=True) > 1e-30  # zero stands for no rotation
+    quats = torch.where(given, quats, torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     R = torch.stack([
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-    ])
-    return R @ torch.diag(torch.exp(2 * splats.log_scales[i])) @ R.T
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1).view(-1, 3, 3)
+    return R @ torch.diag_embed(torch.exp(2 * splats.log_scales[ids])) @ R.mT
 
 
 def _project(
-    local: Tensor, cov: Tensor, R: Tensor, camera: Camera
+    local: Tensor, covs: Tensor, R: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    x, y, z = local
-    mean = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+    x, y, z = local.unbind(1)
+    means = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
     wide, high = 0.15 * camera.width, 0.15 * camera.height
     u = (x / z).clamp((-camera.cx - wide) / camera.fx,
                       (camera.width - camera.cx + wide) / camera.fx)
     v = (y / z).clamp((-camera.cy - high) / camera.fy,
                       (camera.height - camera.cy + high) / camera.fy)
     zero = torch.zeros_like(z)
-    J = torch.stack([
-        torch.stack([camera.fx / z, zero, -camera.fx * u / z]),
-        torch.stack([zero, camera.fy / z, -camera.fy * v / z]),
-    ])
-    return mean, J @ R @ cov @ R.T @ J.T + DILATION * torch.eye(2, dtype=torch.float64)
+    J = torch.stack([camera.fx / z, zero, -camera.fx * u / z,
+                     zero, camera.fy / z, -camera.fy * v / z], 1).view(-1, 2, 3)
+    return means, J @ R @ covs @ R.T @ J.mT + DILATION * torch.eye(2, dtype=torch.float64)
 
 
-def color_towards(splats: Splats, i: int, camera: Camera, degree: int) -> Tensor:
-    """Returns the colour of one Gaussian, [3]."""
-    center = torch.from_numpy(camera.center)
-    direction = splats.means[i] - center
-    basis = sh_basis(direction / direction.norm(), degree)
-    coefficients = splats.sh_dc[i][None]
-    if i < len(splats.sh_rest):  # the others have no more
-        coefficients = torch.cat([coefficients, splats.sh_rest[i]])
-    used = min(len(basis), len(coefficients))
-    return (basis[:used] @ coefficients[:used] + 0.5).clamp_min(0)
+def _colors(splats: Splats, ids: Tensor, camera: Camera, degree: int) -> Tensor:
+    """Returns the colours of Gaussians towards the camera, [M, 3]."""
+    toward = splats.means[ids] - torch.from_numpy(camera.center)
+    basis = sh_basis(toward / toward.norm(dim=1, keepdim=True), degree)
+    colored, terms, _ = splats.sh_rest.shape  # the others have no more than sh_dc
+    nothing = splats.sh_rest.new_zeros(len(splats) - colored, terms, 3)
+    coefficients = torch.cat([splats.sh_dc[:, None], torch.cat([splats.sh_rest, nothing])], 1)
+    used = min(basis.shape[1], 1 + terms)
+    return ((basis[:, :used, None] * coefficients[ids, :used]).sum(1) + 0.5).clamp_min(0)
 
 
 class _Harmonic(torch.autograd.Function):
     """One real spherical harmonic with a central difference as derivative."""
 
     @staticmethod
-    def forward(ctx, direction, degree, order):
-        ctx.save_for_backward(direction)
+    def forward(ctx, directions, degree, order):
+        ctx.save_for_backward(directions)
         ctx.which = degree, order
-        return torch.tensor(_harmonic(direction.numpy(), degree, order), dtype=torch.float64)
+        return torch.from_numpy(_harmonic(directions.numpy(), degree, order))
 
     @staticmethod
     def backward(ctx, grad):
-        direction, (degree, order) = ctx.saved_tensors[0].numpy(), ctx.which
+        directions, (degree, order) = ctx.saved_tensors[0].numpy(), ctx.which
         step = 1e-5
         slopes = [
-            (_harmonic(direction + step * e, degree, order)
-             - _harmonic(direction - step * e, degree, order)) / (2 * step)
+            (_harmonic(directions + step * e, degree, order)
+             - _harmonic(directions - step * e, degree, order)) / (2 * step)
             for e in np.eye(3)
         ]
-        return grad * torch.tensor(slopes, dtype=torch.float64), None, None
+        return grad[:, None] * torch.from_numpy(np.stack(slopes, 1)), None, None
 
 
-def sh_basis(direction: Tensor, degree: int) -> Tensor:
-    """Returns the real spherical harmonics of degree 0 to `degree` at a direction, [K]."""
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Returns the real spherical harmonics of degree 0 to `degree` at directions [N, 3], [N, K]."""
     return torch.stack([
-        _Harmonic.apply(direction, n, m) for n in range(degree + 1) for m in range(-n, n + 1)])
+        _Harmonic.apply(directions, n, m) for n in range(degree + 1) for m in range(-n, n + 1)], 1)
 
 
-def _harmonic(direction: np.ndarray, degree: int, order: int) -> float:
-    x, y, z = direction / np.linalg.norm(direction)
+def _harmonic(directions: np.ndarray, degree: int, order: int) -> np.ndarray:
+    x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     m = abs(order)
     scale = math.sqrt((2 * degree + 1) / (4 * math.pi)
                       * math.factorial(degree - m) / math.factorial(degree + m))
     legendre = lpmv(m, degree, z)  # holds the Condon-Shortley phase (-1)^m, as INRIA's signs do
-    angle = math.atan2(y, x)
     if order == 0:
         return scale * legendre
-    wave = math.sin(m * angle) if order < 0 else math.cos(m * angle)
+    angle = m * np.arctan2(y, x)
+    wave = np.sin(angle) if order < 0 else np.cos(angle)
     return math.sqrt(2) * scale * legendre * wave

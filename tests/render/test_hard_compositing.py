@@ -63,7 +63,7 @@ def test_a_saturated_opacity_keeps_its_gradient_where_alpha_is_not_clamped(case)
     splats = one_splat((0.0, 0.0, 2.0), scale=0.3, opacity=0.5, color=(0.9, 0.5, 0.1))
     for logit in (10.0, 15.0, 40.0):  # 1 - o is 5e-5, 3e-7 and 4e-18
         splats.logit_opacities[:] = logit
-        found = compared(case, splats, camera_at(), degree=0)
+        found = compared(case, splats, camera_at(30, 24), degree=0)
         assert found.gradients["logit_opacities"] <= GRADIENT_TOLERANCE[case.dtype]
         assert found.gradient <= GRADIENT_TOLERANCE[case.dtype]
         assert found.image <= IMAGE_TOLERANCE[case.dtype]
@@ -79,8 +79,8 @@ def test_opacities_below_one_step_are_culled_without_a_gradient(case, logit):
 
 
 @every_backend
-def test_a_thousand_opaque_layers_stop_before_the_third(case):
-    splats = layers(1000, logit=40.0)
+def test_opaque_layers_stop_before_the_third_however_many(case):
+    splats = layers(100 if case.interpreted else 1000, logit=40.0)
     out, tracked = rendered(case, splats, camera_at(8, 8), scores=True)
     left = 1 - out.alpha.double()
     # Two clamped fragments leave 1e-4; the threshold lies a rounding margin below that.
@@ -94,7 +94,7 @@ def test_a_thousand_opaque_layers_stop_before_the_third(case):
 @every_backend
 @pytest.mark.parametrize("logit", [0.0, 2.0, 4.0])
 def test_many_layers_agree_with_the_oracle_until_the_pixel_stops(case, logit):
-    splats = layers(300, logit=logit, seed=1)
+    splats = layers(80, logit=logit, seed=1)  # more than a block of any backend
     found = compared(case, splats, camera_at(8, 8))
     assert found.doubtful == 0
     assert found.image <= IMAGE_TOLERANCE[case.dtype]
@@ -144,8 +144,8 @@ def test_the_thresholds_drop_no_more_than_the_theory_says(case, seed):
     # Dropping a fragment changes a pixel by alpha T (c - B), and c and B, the colour behind, lie
     # between 0 and the greatest colour. Taken out from back to front, each with the transmittance
     # of the picture without thresholds; stopping exchanges what is behind for the background.
-    splats = case.rounded(random_splats(150, seed=seed))
-    camera = camera_at()
+    splats = case.rounded(random_splats(60 if case.interpreted else 150, seed=seed))
+    camera = camera_at(33, 20)
     whole = composited(splats, camera, GREENISH, 0, thresholds=False)
     faint = (whole.alphas > 0) & (whole.alphas < ALPHA_MIN)
     dropped = (whole.weights * faint).sum(0)
@@ -162,13 +162,13 @@ def test_the_thresholds_drop_no_more_than_the_theory_says(case, seed):
 
 @every_backend_at_size
 def test_gaussians_that_cover_every_tile_agree_with_the_oracle(case):
-    splats = random_splats(30, seed=3)
+    splats = random_splats(20, seed=3)
     splats.means[:, 2] = splats.means[:, 2].abs() + 1.0
     splats.log_scales[:] = 1.0
     splats.log_scales[:, 1] = 0.5
     splats.logit_opacities[:] = -2.0
-    found = compared(case, splats, camera_at(70, 45))
-    assert found.doubtful <= 30
+    found = compared(case, splats, camera_at(50, 37))
+    assert found.doubtful <= 18
     assert found.image <= IMAGE_TOLERANCE[case.dtype]
     assert found.gradient <= GRADIENT_TOLERANCE[case.dtype]
 

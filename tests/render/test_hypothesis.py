@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import torch
-from backends import GREENISH, Case, every_backend_at_size
+from backends import CASES, GREENISH, Case
 from examples import examples
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
@@ -20,8 +21,6 @@ from recon_cli.render.contract import DILATION, NEAR, TRANSMITTANCE_MIN
 from recon_cli.render.torch.projection import project
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-
-pytestmark = every_backend_at_size
 
 EXACT = Case("torch", "cpu", torch.float64)
 # An error of the mean, of the offset to a pixel or of an axis is relative: `reach` pixels times
@@ -129,17 +128,8 @@ def _brightest(splats: Splats) -> float:
     return 1.13 * norm.max().item() + 0.5
 
 
-@settings(max_examples=examples(120), derandomize=True, database=None,
-          suppress_health_check=list(HealthCheck))
-@given(scene=scenes())
-def test_any_small_scene_is_finite_and_agrees_with_float64(case, scene):
-    check(case, *scene)
-
-
-@settings(max_examples=examples(120), derandomize=True, database=None,
-          suppress_health_check=list(HealthCheck))
-@given(scene=scenes(), seed=st.integers(0, 100))
-def test_the_order_of_any_small_scene_does_not_matter(case, scene, seed):
+def in_any_order(case, scene, seed):
+    """Asserts that a scene is the same picture in another order of its Gaussians."""
     splats, camera, degree = scene
     depths = splats.means[:, 2].sort().values
     assume(bool((depths.diff() > 1e-5).all()))  # ties go by index
@@ -151,3 +141,45 @@ def test_the_order_of_any_small_scene_does_not_matter(case, scene, seed):
     sure = composited(splats, camera, GREENISH, 0).margin > 1e-4
     error = (first.rgb - second.rgb).abs().amax(-1).detach().cpu()[sure]
     assert (error <= limit).all()
+
+
+COMPILED, INTERPRETED = ([case for case in CASES if case.interpreted is interpreted]
+                         for interpreted in (False, True))
+every_compiled_backend = pytest.mark.parametrize("case", COMPILED, ids=str)
+every_interpreted_backend = pytest.mark.parametrize("case", INTERPRETED, ids=str)
+
+
+def tries(count):
+    """Settings that try so many scenes in the full profile, the same ones in every run."""
+    return settings(max_examples=examples(count), derandomize=True, database=None,
+                    suppress_health_check=list(HealthCheck))
+
+
+@every_compiled_backend
+@tries(120)
+@given(scene=scenes())
+def test_any_small_scene_is_finite_and_agrees_with_float64(case, scene):
+    check(case, *scene)
+
+
+@pytest.mark.slow
+@every_interpreted_backend
+@tries(30)
+@given(scene=scenes())
+def test_any_small_scene_is_finite_and_agrees_with_float64_in_an_interpreter(case, scene):
+    check(case, *scene)
+
+
+@every_compiled_backend
+@tries(120)
+@given(scene=scenes(), seed=st.integers(0, 100))
+def test_the_order_of_any_small_scene_does_not_matter(case, scene, seed):
+    in_any_order(case, scene, seed)
+
+
+@pytest.mark.slow
+@every_interpreted_backend
+@tries(30)
+@given(scene=scenes(), seed=st.integers(0, 100))
+def test_the_order_of_any_small_scene_does_not_matter_in_an_interpreter(case, scene, seed):
+    in_any_order(case, scene, seed)

@@ -30,16 +30,16 @@ def test_every_kernel_compiles_for_gpus_old_and_new_without_spilling(tmp_path):
 
 def pictures(splats, case):
     tracked = case.leaves(splats)
-    out = case.render(tracked, camera_at(33, 20), GREENISH, 3, scores=True)
+    out = case.render(tracked, camera_at(20, 18), GREENISH, 3, scores=True)
     (out.rgb.square().sum() + out.depth.sum() + out.alpha.square().sum()).backward()
     return [out.rgb, out.depth, tracked.means.grad, tracked.sh_rest.grad, out.statistics.loo]
 
 
 def test_the_same_small_scene_gives_the_same_bits_in_any_order_of_its_gaussians():
-    case, splats = Case("triton", DEVICE, torch.float32), random_splats(40, seed=2)
+    case, splats = Case("triton", DEVICE, torch.float32), random_splats(24, seed=2)
     first, again = pictures(splats, case), pictures(splats, case)
     assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(24, generator=torch.Generator().manual_seed(0))
     turned = pictures(splats.select(order), case)
     assert torch.equal(first[0], turned[0])
     assert torch.equal(first[2][order.to(DEVICE)], turned[2])

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 from interpreter import DEVICE
-from tiny_scene import make_inputs
+from tiny_scene import Shape, make_inputs
 from tiny_stages import CONTEXT, run
 
 from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
@@ -27,6 +27,8 @@ ON_TRITON = replace(CONTEXT, backend="triton", device=DEVICE)
 CONFIG = RunConfig(
     iterations=8, densify_every=4, max_gaussians=80, sh_degree=0, far="off", exposure="off",
     images="original", checkpoint_every=3, early_stop=False)
+SMALL = Shape(22, 18, 18.0)  # four tiles
+VIEWS = 6  # two of them held out
 FILES = ("splats.ply", "mid.safetensors", "final.safetensors")
 
 
@@ -35,7 +37,7 @@ class Killed(Exception):  # noqa: N818 - an event, not an error
 
 
 def test_every_stage_runs_and_a_killed_training_ends_with_the_same_bytes(tmp_path, monkeypatch):
-    inputs = make_inputs(tmp_path)
+    inputs = make_inputs(tmp_path, (SMALL,), VIEWS)
     run(train, CONFIG, inputs, tmp_path / "train", ON_TRITON)
 
     def save_then_die(path, state):

@@ -67,8 +67,10 @@ def pixels_of(i: int, shape: Shape) -> np.ndarray:
     return (rgb.numpy() * 255 + 0.5).astype(np.uint8)
 
 
-def make_inputs(folder: Path, shapes: tuple[Shape, ...] = ONE) -> StageInputs:
-    """Writes what ingest and sfm would have left of 12 views of the truth.
+def make_inputs(
+    folder: Path, shapes: tuple[Shape, ...] = ONE, views: int = VIEWS
+) -> StageInputs:
+    """Writes what ingest and sfm would have left of views of the truth.
 
     Each shape takes four views in a row, the first of which is held out.
     """
@@ -84,7 +86,7 @@ def make_inputs(folder: Path, shapes: tuple[Shape, ...] = ONE) -> StageInputs:
     for path in (images, denoised, sparse, folder / "ingest"):
         path.mkdir(parents=True)
     frames = []
-    for i in range(VIEWS):
+    for i in range(views):
         name = f"{i:06d}.png"
         group = i // 4 % len(shapes)
         pose = viewmat(i)

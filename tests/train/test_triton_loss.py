@@ -18,7 +18,7 @@ def images(height, width, seed=0):
     return (truth / 255 + 0.1 * noise).float(), truth
 
 
-@pytest.mark.parametrize("size", [(23, 31), (1, 40), (3, 1)])
+@pytest.mark.parametrize("size", [(13, 23), (1, 40), (3, 1)])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("masked", [False, True])
 def test_loss_and_gradient_agree_with_float64(size, ssim_weight, masked):
@@ -38,8 +38,8 @@ def test_loss_and_gradient_agree_with_float64(size, ssim_weight, masked):
 
 
 def test_what_is_not_finite_does_no_harm_under_a_mask():
-    image, truth = images(20, 20)
-    mask = torch.ones(20, 20, dtype=torch.uint8)
+    image, truth = images(14, 16)
+    mask = torch.ones(14, 16, dtype=torch.uint8)
     mask[7, 9] = 0
     image[7, 9] = torch.nan
     loss, gradient = loss_module.loss_and_gradient(

@@ -20,19 +20,21 @@ from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_
 from recon_cli.train.optimizer import SplatOptimizer
 
 pytest.importorskip("triton", reason="triton is not installed")
-CAMERA = camera_at(24, 18)
+WIDTH, HEIGHT = 18, 17  # four tiles, three of them cut by the border
+CAMERA = camera_at(WIDTH, HEIGHT, focal=30.0)
 DEGREE, WEIGHT, DEPTH_WEIGHT = 3, 0.2, 0.005
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-6, 1e-4
 GAIN = np.array([0.8, 1.1, 1.3], np.float32)
-SEEN = random_splats(30, seed=3).map(torch.Tensor.float)
+COUNT = 20
+SEEN = random_splats(COUNT, seed=3).map(torch.Tensor.float)
 
 
 def photograph():
-    return np.random.default_rng(0).integers(0, 256, (18, 24, 3), np.uint8)
+    return np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
 def half():
-    return np.random.default_rng(1).random((18, 24)) < 0.5
+    return np.random.default_rng(1).random((HEIGHT, WIDTH)) < 0.5
 
 
 def step(splats, view, gain=None, **wanted):
@@ -91,7 +93,7 @@ def test_a_step_leaves_loss_gradients_and_statistics(mask, gain):
 
 def depth():
     """What a sensor measures at every second pixel, more than half of it other than it is."""
-    row, column = np.mgrid[0:18:2, 0:24:2].reshape(2, -1)
+    row, column = np.mgrid[0:HEIGHT:2, 0:WIDTH:2].reshape(2, -1)
     rays = np.stack([(column + 0.5 - CAMERA.cx) / CAMERA.fx,
                      (row + 0.5 - CAMERA.cy) / CAMERA.fy], 1)
     z = np.random.default_rng(2).uniform(1.5, 4, len(row))
@@ -139,7 +141,7 @@ def test_a_view_that_sees_nothing_has_a_loss_and_no_gradient():
 
 
 def test_a_view_under_a_mask_that_hides_all_moves_nothing():
-    view = TrainView(CAMERA, photograph(), np.zeros((18, 24), bool))
+    view = TrainView(CAMERA, photograph(), np.zeros((HEIGHT, WIDTH), bool))
     optimizer, _, loss, _ = step(SEEN, view)
     assert loss == 0
     assert not optimizer.gradient("means").any()
@@ -151,7 +153,7 @@ def test_adam_moves_as_torch_does_and_only_where_the_step_counts():
         SEEN.map(lambda tensor, to=to: tensor.clone().to(to)), CONFIG, 1.0, backend=backend)
         for backend, to in (("triton", DEVICE), ("torch", "cpu")))
     for number, counted in enumerate((1, 0, 1, 1, 0)):
-        gradients = gradients_of(30, number)
+        gradients = gradients_of(COUNT, number)
         for name, value in gradients.parameters().items():
             getattr(ours.gradients, name).copy_(value)
             getattr(plain.splats, name).grad = value.clone()
