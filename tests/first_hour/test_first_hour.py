@@ -5,6 +5,8 @@ Sizes are small: what is tested is that every step works, and that the next one 
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import shutil
@@ -25,30 +27,40 @@ SMALL = ("--set", "sfm.max_features=1500", "--set", "train.iterations=40",
          "--set", "train.max_size=96", "--set", "train.densify_every=10", "--threads", "2")
 
 
-def recon(folder: Path, *words: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "recon_cli", *map(str, words)], cwd=folder, text=True,
-        capture_output=True, check=False, env={**os.environ, "RECON_WORKSPACE": ""})
-    assert done.returncode == code, done.stderr
-    return done
+def recon(folder: Path, *words: object, code: int = 0) -> str:
+    """Returns what a command prints that is typed in a folder."""
+    printed = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+        assert main([*map(str, words)]) == code
+    return printed.getvalue()
 
 
-def next_words(done: subprocess.CompletedProcess[str]) -> list[str]:
+def next_words(printed: str) -> list[str]:
     """The command that is named at the end, without `recon`."""
-    line = next(line for line in done.stdout.splitlines() if line.startswith("next:"))
+    line = next(line for line in printed.splitlines() if line.startswith("next:"))
     return line.partition("recon ")[2].partition(" or recon ")[0].split()
+
+
+@pytest.fixture(autouse=True)
+def _workspace_in_the_folder(monkeypatch):
+    monkeypatch.delenv("RECON_WORKSPACE", raising=False)
 
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory, sample_video):
     """A folder in which somebody has typed one command about a video."""
     folder = tmp_path_factory.mktemp("video")
-    return folder, recon(folder, "run", sample_video, *FRAMES, "--title", "Our room", *SMALL)
+    words = ["run", sample_video, *FRAMES, "--title", "Our room", *SMALL]
+    done = subprocess.run(
+        [sys.executable, "-m", "recon_cli", *map(str, words)], cwd=folder, text=True,
+        capture_output=True, check=False, env={**os.environ, "RECON_WORKSPACE": ""})
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
 
 
 def test_one_command_makes_a_page_of_a_video(filmed):
-    folder, done = filmed
-    named = {line.split(":")[0]: line.split()[1] for line in done.stdout.splitlines()
+    folder, printed = filmed
+    named = {line.split(":")[0]: line.split()[1] for line in printed.splitlines()
              if line.split(":")[0] in ("scene", "page", "report")}
     assert named.keys() == {"scene", "page", "report"}
     assert all((folder / path).is_file() for path in named.values())
@@ -57,8 +69,8 @@ def test_one_command_makes_a_page_of_a_video(filmed):
 
 
 def test_what_is_named_next_after_a_video_works(filmed):
-    folder, done = filmed
-    words = next_words(done)
+    folder, printed = filmed
+    words = next_words(printed)
     assert words[:2] == ["render", "--tour"]
     recon(folder, *words, "--seconds", 0.2, "--fps", 10)
     assert (folder / "walk.mp4").stat().st_size > 1000
@@ -66,12 +78,12 @@ def test_what_is_named_next_after_a_video_works(filmed):
 
 def test_the_same_command_again_finds_everything_done(filmed, sample_video):
     folder, _ = filmed
-    done = recon(folder, "run", sample_video, *FRAMES, "--title", "Our room", *SMALL)
-    assert done.stdout.count("is up to date") == 7
+    printed = recon(folder, "run", sample_video, *FRAMES, "--title", "Our room", *SMALL)
+    assert printed.count("is up to date") == 7
 
 
 def test_a_time_for_the_whole_run_is_a_choice_that_is_kept(
-    filmed, tmp_path, sample_video, monkeypatch, capsys
+    filmed, tmp_path, sample_video, monkeypatch
 ):
     # without these seconds put aside for scores, and for training at least, it takes a minute
     monkeypatch.setattr(budget, "_SCORES", 1.0)
@@ -79,22 +91,20 @@ def test_a_time_for_the_whole_run_is_a_choice_that_is_kept(
     workspace = tmp_path / "workspace"
     shutil.copytree(filmed[0] / "workspace", workspace)  # its cameras stay
     words = ["run", sample_video, *FRAMES, "--minutes", 0.15, "--set", "sfm.max_features=1500",
-             "--set", "train.max_size=96", "-w", workspace, "--threads", 1]
-    assert main([str(word) for word in words]) == 0
+             "--set", "train.max_size=96", "--threads", 1]
+    recon(tmp_path, *words)
     chosen = json.loads((workspace / "budget.json").read_text())
     assert chosen["train_minutes"] > 0
-    capsys.readouterr()
-    assert main([str(word) for word in words]) == 0
-    assert "is up to date" in capsys.readouterr().out
+    assert "is up to date" in recon(tmp_path, *words)
     assert json.loads((workspace / "budget.json").read_text()) == chosen
 
 
 def test_a_data_set_with_poses(tmp_path):
     make_replica(tmp_path / "office0", frames=8, tests=2)
-    done = recon(tmp_path, "run", "office0", "--set", "train.iterations=100", "--set",
+    printed = recon(tmp_path, "run", "office0", "--set", "train.iterations=100", "--set",
                  "train.max_gaussians=300", "--set", "train.validation=0", "--no-prune")
     # its one colour is fitted so well that the rounding of a page costs many dB, which 8 bits hide
-    assert next_words(done)[:2] == ["render", "--tour"]
+    assert next_words(printed)[:2] == ["render", "--tour"]
     assert (tmp_path / "workspace" / "export" / "splats.html").is_file()
     recon(tmp_path, "run", "--format", "html", "--set", "export.max_loss=0.3", "--set",
           "train.iterations=100", "--set", "train.max_gaussians=300", "--set",
@@ -104,13 +114,13 @@ def test_a_data_set_with_poses(tmp_path):
 def test_a_server_with_many_captures_one_of_which_is_damaged(tmp_path):
     make_replica(tmp_path / "good", frames=8, tests=2)
     (tmp_path / "bad.mp4").write_bytes(b"not a video")
-    done = recon(tmp_path, "batch", "good", "bad.mp4", "--out", "scenes", "--jobs", 1, *SMALL,
+    printed = recon(tmp_path, "batch", "good", "bad.mp4", "--out", "scenes", "--jobs", 1, *SMALL,
                  code=5)
     record = json.loads((tmp_path / "scenes" / "batch.json").read_text())
     ended = {one["capture"]: one["exit_code"] for one in record["captures"]}
     assert ended["good"] == 0
     assert ended["bad"] == 3
-    words = next_words(done)
+    words = next_words(printed)
     assert words[0] == "view"
     recon(tmp_path, "status", *words[1:])
 
@@ -119,7 +129,7 @@ def test_a_splat_file_of_another_program(filmed, tmp_path):
     folder, _ = filmed
     recon(folder, "export", "--format", "spz")
     (folder / "workspace" / "export" / "splats.spz").rename(tmp_path / "scene.spz")
-    done = recon(tmp_path, "import", "scene.spz")
-    assert next_words(done) == ["view"]
+    printed = recon(tmp_path, "import", "scene.spz")
+    assert next_words(printed) == ["view"]
     recon(tmp_path, "export", "--format", "html")
     assert (tmp_path / "workspace" / "export" / "splats.html").is_file()
