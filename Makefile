@@ -14,6 +14,9 @@ PYTEST := $(BIN)/python -m pytest -q -rs --durations 20 $(ON_ALL)
 # The lowest versions that pyproject.toml allows, on the oldest Python that it allows.
 OLDEST ?= python3.11
 FLOORS := .venv-floors
+# Bytecode is kept, whatever the environment says: else each process compiles all modules anew, and
+# pytest rewrites each test's assertions.
+unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo test test-floors test-rest test-all coverage faults check docs clean
 
 demo: $(READY)

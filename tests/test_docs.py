@@ -93,8 +93,8 @@ def test_the_batch_example_continues_after_a_failure_and_says_so(tmp_path, sampl
     environment = {
         **os.environ, "OMP_NUM_THREADS": "1",
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    small = {"ingest.frames": 24, "sfm.max_features": 1500, "train.iterations": 10,
-             "train.max_size": 80}
+    small = {"ingest.frames": 16, "ingest.max_size": 320, "sfm.max_features": 1500,
+             "train.iterations": 10, "train.max_size": 80}
     options = [word for key, value in small.items() for word in ("--set", f"{key}={value}")]
     done = subprocess.run(
         [str(ROOT / "docs" / "examples" / "batch.sh"), str(videos), str(results), *options],

@@ -7,6 +7,7 @@ import hashlib
 import shlex
 from collections.abc import Mapping
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -146,16 +147,21 @@ def _template_values(
     }
 
 
-def _render_page(values: Mapping[str, Any], gallery: Gallery) -> bytes:
+@cache  # which keeps the templates compiled: a page that is too large is rendered again
+def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True)
     environment.filters.update(
         duration=format_duration, megabytes=format_megabytes, facts=format_facts)
+    return environment
+
+
+def _render_page(values: Mapping[str, Any], gallery: Gallery) -> bytes:
     script = (_HERE / "script.js").read_text(encoding="utf-8")
     # the hash in the content policy lets the browser run this script and no other
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    page = environment.get_template("report.html.j2").render(
+    page = _environment().get_template("report.html.j2").render(
         **values, gallery=gallery, data=[_script_data(view) for view in gallery.views],
         style=Markup((_HERE / "style.css").read_text(encoding="utf-8")),
         script=Markup(script), script_hash=digest)

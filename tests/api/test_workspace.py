@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
 
 import fake_stages
@@ -152,9 +153,14 @@ def test_a_capture_from_python_is_that_of_the_commands(
     assert capfd.readouterr() == ("", "")
     # the same by commands: the same results, and each takes those of the other for fresh
     write_options(tmp_path / "other")
+    for stage in ("ingest", "denoise", "sfm"):
+        shutil.copytree(opened.path / stage, tmp_path / "other" / stage)
     at = ["-w", str(tmp_path / "other")]
     for command in (["ingest", str(sample_video)], ["train"], ["prune", "--ratio", "0.5"]):
         assert cli.main([*command, *at]) == 0
+    for stage in ("ingest", "denoise", "sfm"):
+        name = f"{stage}/manifest.json"
+        assert (tmp_path / "other" / name).read_bytes() == (opened.path / name).read_bytes()
     for stage in ("train", "prune"):
         name = f"{stage}/splats.ply"
         assert (tmp_path / "other" / name).read_bytes() == (opened.path / name).read_bytes()

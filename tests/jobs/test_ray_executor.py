@@ -20,7 +20,7 @@ from recon_cli.workspace.layout import Workspace
 ray = pytest.importorskip("ray")
 from ray_clusters import STORE_BYTES, cluster_for, node_of, start_cluster  # noqa: E402
 
-STEPS, SAVE_EVERY = 6000, 200
+STEPS, SAVE_EVERY = 1500, 50
 
 
 def node(cpus, gpus=0):

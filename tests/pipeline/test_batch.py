@@ -189,7 +189,8 @@ def test_two_batches_do_not_share_a_folder(tmp_path, capsys):
     assert not (tmp_path / "out" / "batch.json").exists()
 
 
-SLOW = ("train.iterations=3000", "train.max_size=32", "train.checkpoint_every=100")
+STEPS = 1200
+SLOW = (f"train.iterations={STEPS}", "train.max_size=32", "train.checkpoint_every=40")
 
 
 def batch_words(inputs, out, settings, *more):
@@ -228,16 +229,16 @@ def test_a_batch_whose_processes_are_killed_ends_with_the_same_bytes(tmp_path):
     with subprocess.Popen(
             [sys.executable, "-m", "recon_cli", *words], stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT) as process:
-        wait_for(lambda: saved_steps(workspace) >= 200)
+        wait_for(lambda: saved_steps(workspace) >= 80)
         first = training_process(process)
         first.send_signal(signal.SIGKILL)
         first.wait(60)
         second = wait_for(lambda: training_process(process))
-        wait_for(lambda: saved_steps(workspace) >= 600)
+        wait_for(lambda: saved_steps(workspace) >= 240)
         process.send_signal(signal.SIGKILL)
         process.wait()
     second.wait(60)  # it ends with the batch
-    assert saved_steps(workspace) < 3000
+    assert saved_steps(workspace) < STEPS
     assert main(words) == 0
     for name in ("train/splats.ply", "export/splats.ply"):
         expected = tmp_path / "expected" / "room" / name

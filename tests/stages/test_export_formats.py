@@ -78,16 +78,16 @@ def test_the_images_of_the_cameras_lie_beside_them(exported, inputs):
 
 
 @pytest.mark.slow
-def test_an_export_that_was_killed_goes_on_over_what_it_left(inputs, tmp_path):
-    config = ExportConfig(format=",".join(ASKED))
-    export.run(config, inputs, tmp_path, CONTEXT)
-    before = {path.relative_to(tmp_path): path.read_bytes()
-              for path in tmp_path.rglob("*") if path.is_file()}
-    (tmp_path / "transforms.json").unlink()
-    (tmp_path / "sparse" / "0" / "images.bin").unlink()
-    export.run(config, inputs, tmp_path, CONTEXT)
-    assert before == {path.relative_to(tmp_path): path.read_bytes()
-                      for path in tmp_path.rglob("*") if path.is_file()}
+def test_an_export_that_was_killed_goes_on_over_what_it_left(exported, inputs, tmp_path):
+    whole, _ = exported
+    out = tmp_path / "export"
+    shutil.copytree(whole, out)
+    (out / "transforms.json").unlink()
+    (out / "sparse" / "0" / "images.bin").unlink()
+    export.run(ExportConfig(format=",".join(ASKED)), inputs, out, CONTEXT)
+    before, after = ({path.relative_to(folder): path.read_bytes()
+                      for path in folder.rglob("*") if path.is_file()} for folder in (whole, out))
+    assert before == after
 
 
 def test_points_are_those_of_the_room_not_of_what_its_windows_show(inputs, tmp_path):

@@ -17,7 +17,7 @@ from recon_cli.stages import evaluate, export, prune, train
 from recon_cli.train import runner
 from recon_cli.train.state import save_state
 
-CONTEXT = StageContext()
+CONTEXT = StageContext(backend="numba")
 
 
 def config_of(degree):

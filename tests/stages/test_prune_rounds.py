@@ -26,7 +26,7 @@ CONFIG = TrainConfig(
     iterations=120, densify_every=10, max_gaussians=120, sh_rate=0.05, checkpoint_every=3,
     validation=0.2)
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
-CONTEXT = StageContext()
+CONTEXT = StageContext(backend="numba")
 THREE = PruneConfig(ratio=0.6, rounds=3, recovery=60)
 SEARCH = PruneConfig(max_psnr_drop=1.0, rounds=3, recovery=30)
 

@@ -19,7 +19,7 @@ CONFIG = RunConfig(
     checkpoint_every=7)
 PRUNE = PruneConfig(ratio=0.5, at="mid")
 LEARNT = RunConfig(iterations=120, max_gaussians=120, sh_rate=0.01)  # harmonics that show
-CONTEXT = StageContext()
+CONTEXT = StageContext(backend="numba")
 
 
 def trained(folder, config=CONFIG):

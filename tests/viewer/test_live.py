@@ -1,7 +1,7 @@
 """`recon train --view`: the training is the same, and looks are rare where they cost much."""
 
-import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,11 +10,11 @@ import pytest
 import torch
 from scenes import random_splats
 from tiny_scene import make_inputs
-from tiny_stages import CONFIG, run
+from tiny_stages import CONFIG, CONTEXT, run
 from viewing import complaints, nodes, until
 
 from recon_cli.cli import main
-from recon_cli.context import StageContext, TrainCallback
+from recon_cli.context import TrainCallback
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import train
 from recon_cli.viewer import live
@@ -22,7 +22,7 @@ from recon_cli.viewer.live import SHARE, LiveView
 from recon_cli.viewer.server import HOST, start_server
 from recon_cli.workspace.layout import Workspace
 
-SHORT = dataclasses.replace(CONFIG, iterations=60)
+SHORT = replace(CONFIG, iterations=60)
 
 
 class Spy(TrainCallback):
@@ -54,7 +54,7 @@ def plain(tmp_path_factory):
 def test_a_callback_sees_every_step_and_changes_nothing(plain, tmp_path):
     inputs, expected = plain
     spy = Spy()
-    run(train, SHORT, inputs, tmp_path / "train", StageContext(callbacks=(spy,)))
+    run(train, SHORT, inputs, tmp_path / "train", replace(CONTEXT, callbacks=(spy,)))
     assert (tmp_path / "train" / "splats.ply").read_bytes() == expected
     assert [(label, until, cameras) for label, until, cameras, _ in spy.begun] == [
         ("train", 60, 8)]
@@ -78,7 +78,7 @@ def test_a_training_that_is_looked_at_in_a_browser_is_the_same_to_the_byte(
         page.page.get_by_text("Waiting for the training").wait_for(timeout=60_000)
         until(page, server.get_clients)
         done = elsewhere.submit(
-            run, train, SHORT, inputs, tmp_path / "train", StageContext(callbacks=(view,)))
+            run, train, SHORT, inputs, tmp_path / "train", replace(CONTEXT, callbacks=(view,)))
         until(page, done.done)
         done.result()
         page.page.get_by_text("of 60").wait_for(timeout=60_000)
