@@ -107,12 +107,14 @@ def _pass_operands_alike(interpreter: ModuleType) -> None:
 
 
 def _spare_the_interpreter() -> None:
-    """Changes what was found in one version of triton, and only where a version has it."""
+    """Changes what was found in one version of triton, where a version has all of it."""
     from triton.runtime import interpreter
 
-    if all(hasattr(interpreter, name) for name in (
-            "_patch_lang", "_patch_attr", "_LangPatchScope")):
-        _patch_language_once(interpreter)
+    if not all(hasattr(interpreter, name) for name in (
+            "_patch_lang", "_patch_attr", "_LangPatchScope", "_get_np_dtype", "TritonSemantic",
+            "interpreter_builder", "interpreter_semantic")):
+        return
+    _patch_language_once(interpreter)
     _skip_unread_overflows(interpreter)
     _share_types(interpreter)
     _pass_operands_alike(interpreter)
