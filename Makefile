@@ -17,13 +17,20 @@ FLOORS := .venv-floors
 # Bytecode is kept, whatever the environment says: else each process compiles all modules anew, and
 # pytest rewrites each test's assertions.
 unexport PYTHONDONTWRITEBYTECODE
-.PHONY: demo test test-floors test-rest test-all coverage faults check docs clean
+.PHONY: demo test test-other-cpu test-floors test-rest test-all coverage faults check docs clean
 
 demo: $(READY)
 	$(BIN)/recon demo
 
 test: $(DEV)
 	$(PYTEST) -m "not ($(HEAVY))"
+
+# Numbers round otherwise on other processors: the same tests without torch's vector code, say, or
+# OTHER_CPU=NUMBA_CPU_NAME=haswell, the kernels of a laptop with AVX2.
+OTHER_CPU ?= ATEN_CPU_CAPABILITY=default
+
+test-other-cpu: $(DEV)
+	env $(OTHER_CPU) $(PYTEST) -m "not ($(HEAVY))" tests/render tests/train tests/stereo
 
 # Kernels that one version of numba compiled are of no use to another: they have their own place.
 test-floors: $(FLOORS)/.ready

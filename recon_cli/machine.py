@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import platform
+import re
+import shlex
 import sys
 import threading
 import time
@@ -14,10 +17,10 @@ from types import TracebackType
 
 import psutil
 
-from recon_cli import cgroups
+from recon_cli import __version__, cgroups
 
+DISTRIBUTION = "recon-gs"  # `recon-cli` on PyPI is somebody else's, with a command `recon` too
 _PACKAGES = {
-    "recon": "recon-cli",
     "torch": "torch",
     "pycolmap": "pycolmap",
     "opencv": "opencv-contrib-python-headless",
@@ -34,7 +37,7 @@ _SAMPLE_SECONDS = 0.5  # a sample of all children takes about 5 ms
 
 def versions() -> dict[str, str]:
     """Returns the versions of Python and of the packages that a result depends on."""
-    return {"python": platform.python_version(),
+    return {"python": platform.python_version(), "recon": __version__,
             **{name: _version(package) for name, package in _PACKAGES.items()}}
 
 
@@ -44,6 +47,52 @@ def _version(package: str) -> str:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return "missing"
+
+
+def install_command(extra: str) -> str:
+    """Returns the command that adds an extra of pyproject.toml to the environment of this process.
+
+    In a clone that is the clone with the extra. A wheel may lie anywhere by now, so elsewhere the
+    command names the packages of the extra.
+    """
+    clone = Path(__file__).parents[1]
+    if (clone / "pyproject.toml").is_file():
+        wanted = ["-e", f"{_relative(clone)}[{extra}]"]
+    else:
+        wanted = _requirements(extra)
+    words = [*_installer(), *wanted]
+    return shlex.join(words)
+
+
+def _requirements(extra: str) -> list[str]:
+    """Returns what an extra adds, as its wheel says."""
+    marker = re.compile(rf"""extra\s*==\s*['"]{re.escape(extra)}['"]""")
+    try:
+        lines = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        lines = []
+    return [line.partition(";")[0].strip() for line in lines if marker.search(line)] or [extra]
+
+
+def _installer() -> list[str]:
+    """Returns the words that install packages into this environment."""
+    prefix, python = Path(sys.prefix), Path(sys.executable)
+    if (prefix / "pipx_metadata.json").is_file():
+        return ["pipx", "inject", DISTRIBUTION]
+    if importlib.util.find_spec("pip") is None:  # uv makes environments without it
+        return ["uv", "pip", "install", "--python", str(python)]
+    pip = python.with_name("pip.exe" if sys.platform == "win32" else "pip")
+    if pip.is_file():
+        return [_relative(pip), "install"]
+    return [str(python), "-m", "pip", "install"]
+
+
+def _relative(path: Path) -> str:
+    """Returns a path as one types it here: short where it lies below the current folder."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except (ValueError, OSError):  # elsewhere; or the current folder is gone
+        return str(path)
 
 
 def usable_threads() -> int:

@@ -17,7 +17,7 @@ def cells() -> list[dict]:
 
 def test_it_is_stripped_of_outputs_and_begins_with_the_installation() -> None:
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells())
-    assert "%pip install -q recon-cli" in "".join(cells()[0]["source"])
+    assert "%pip install -q ../.." in "".join(cells()[0]["source"])
 
 
 @pytest.mark.slow

@@ -7,6 +7,10 @@ import re
 import tomllib
 from pathlib import Path
 
+import pytest
+
+from recon_cli.cli import VERBS
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 HOME = "https://github.com/recon-cli/recon"
@@ -42,3 +46,37 @@ def test_an_image_gets_all_that_the_build_needs_and_nothing_else():
     assert taken == {"recon_cli", "constraints.txt", "LICENSE", "pyproject.toml", "README.md",
                      "setup.py"}
     assert all((ROOT / name).exists() for name in taken)
+
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def first_block() -> list[str]:
+    """The commands of the README's first code block, without their comments."""
+    block = re.search(r"^```\n(.*?)^```", README, re.M | re.S)[1]
+    return [line.partition(" #")[0].strip() for line in block.splitlines()]
+
+
+def test_the_readme_begins_with_commands_that_a_fresh_clone_has():
+    demo, test, recon = first_block()
+    assert (demo, test) == ("make demo", "make test")
+    assert recon.startswith(".venv/bin/recon run ")
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
+    assert set(re.findall(r"(?:^|`)make ([a-z-]+)", README, re.M)) <= targets
+    assert set(re.findall(r"\.venv/bin/recon (\w+)", README)) <= set(VERBS)
+
+
+def test_every_change_is_checked_by_the_command_that_the_readme_names():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert re.search(r"^ *part test$", script, re.M)
+
+
+@pytest.mark.parametrize("page", [
+    *ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("docs/**/*.ipynb"),
+    *ROOT.glob(".github/**/*.yml"), *ROOT.glob("recon_cli/**/*.py"), ROOT / "constraints.txt",
+    ROOT / "Dockerfile"], ids=lambda page: page.name)
+def test_nothing_installs_the_project_by_a_name_of_pypi(page: Path):
+    """It is not published, and `recon-cli` there is another project."""
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"install[^\n`]*\brecon-(cli|gs)\b", text)
+    assert not re.search(r"\brecon-cli\[", text)

@@ -94,7 +94,7 @@ def _output_options(plot: str) -> Decorator:
             click.option("--out", "json_file", type=_FILE,
                          help="Write all figures to FILE, as JSON.  [default: nowhere]"),
             click.option("--plot", type=_FILE, help=(
-                f"{plot} into a .png or .svg; needs recon-cli[plot].  [default: nowhere]")),
+                f"{plot} into a .png or .svg; needs matplotlib.  [default: nowhere]")),
             click.option(
                 "--markdown", type=_FILE,
                 help="Write the tables between the lines `<!-- recon bench: begin -->` and "

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
+from recon_cli.machine import install_command
 from recon_cli.scene.train_view import BORDER, MIN_SIDE, without_border
 from recon_cli.workspace.digests import digest_file
 
@@ -164,7 +165,7 @@ def load_lpips() -> tuple[Perceptual | None, str]:
     try:
         import lpips
     except ModuleNotFoundError:
-        return None, "the package lpips is not installed (pip install 'recon-cli[lpips]')"
+        return None, f"the package lpips is not installed (`{install_command('lpips')}`)"
     except (ImportError, OSError, RuntimeError) as error:  # torchvision was built for another torch
         cause = str(error).partition("\n")[0]
         return None, (f"the package lpips cannot be imported ({cause}); it needs the torchvision "

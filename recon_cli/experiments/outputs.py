@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recon_cli.errors import ConfigError, FormatError, InputError
+from recon_cli.machine import install_command
 from recon_cli.workspace import atomic
 
 if TYPE_CHECKING:  # it imports scipy, for which `--help` must not wait
     from recon_cli.evaluation.scores import Table
 
 BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"
-_INSTALL = "pip install 'recon-cli[plot]'"
 
 logger = logging.getLogger("recon")
 
@@ -64,7 +64,8 @@ class Result:
         if _can_draw():
             self.draw(folder / f"{name}.svg")
         else:
-            logger.warning("%s.svg is not drawn: matplotlib is not installed; %s", name, _INSTALL)
+            logger.warning("%s.svg is not drawn: matplotlib is not installed; run `%s`", name,
+                           install_command("plot"))
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ class OutputFiles:
                 f"--plot is {self.plot}, but it must end in .png or .svg.",
                 hint=f"Try --plot {self.plot.with_suffix('.svg').name}.")
         if self.plot is not None and not _can_draw():
-            raise ConfigError("--plot needs matplotlib, which is not installed.", hint=_INSTALL)
+            raise ConfigError("--plot needs matplotlib, which is not installed.",
+                              hint=f"Run `{install_command('plot')}`.")
         if self.markdown is not None:
             _with_text(self.markdown, "")
 

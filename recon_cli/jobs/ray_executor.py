@@ -25,6 +25,7 @@ except ImportError:  # `connect` says so
 from recon_cli import __version__
 from recon_cli.errors import BackendError, ExitCode, ReconError, WorkspaceError, list_names
 from recon_cli.jobs.executor import CORES, TRIES, Command, RunningCommand
+from recon_cli.machine import install_command
 from recon_cli.signals import keeping_handlers
 from recon_cli.workspace.atomic import write_bytes
 
@@ -61,7 +62,7 @@ class RayExecutor:
         """
         if ray is None:
             raise BackendError(
-                "Ray is not installed.", hint="Run `pip install 'recon-cli[ray]'`.")
+                "Ray is not installed.", hint=f"Run `{install_command('ray')}`.")
         if os.environ.get(_INSIDE):  # it would wait for CPUs that whoever waits for it holds
             raise BackendError(
                 "A command that Ray runs cannot share out its work on Ray again.",
@@ -209,8 +210,8 @@ def _check_nodes(nodes: Sequence[dict[str, Any]], folder: Path, inputs: Sequence
 
 
 def _check_node(address: str, answer: Any, folder: Path) -> None:
-    install = (f"Run `pip install 'recon-cli[ray]=={__version__}'` there, in the environment in "
-               "which `ray start` was typed.")
+    install = (f"Install recon {__version__} with its extra `ray` there, from the clone or wheel "
+               "that this machine has, in the environment in which `ray start` was typed.")
     try:
         found = ray.get(answer, timeout=_PROBE_SECONDS)
     except ray.exceptions.RayError as error:

@@ -11,6 +11,7 @@ from skimage.metrics import structural_similarity
 from recon_cli.evaluation import metrics
 from recon_cli.evaluation.metrics import both_ssim, load_lpips, psnr, ssim
 from recon_cli.io.images import to_uint8
+from recon_cli.machine import install_command
 from recon_cli.scene.train_view import leaves_enough
 from recon_cli.train.gradient import photometric_loss
 
@@ -132,7 +133,7 @@ def test_lpips_is_left_out_with_its_reason_where_package_or_weights_are_missing(
     monkeypatch.setitem(sys.modules, "lpips", None)
     distance, reason = load_lpips()
     assert distance is None
-    assert "recon-cli[lpips]" in reason
+    assert install_command("lpips") in reason
     monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     distance, reason = load_lpips()

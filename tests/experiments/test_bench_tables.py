@@ -40,7 +40,7 @@ from recon_cli.experiments.rasterizer_benchmark import (
     read_record,
     tables,
 )
-from recon_cli.machine import cpu_model
+from recon_cli.machine import cpu_model, install_command
 
 EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)
 ROUGH = Accuracy(0.1, 0.01, 0.5, 0.2, "quats", 0.9)
@@ -280,7 +280,7 @@ def test_without_matplotlib_the_hint_names_the_extra(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(outputs.importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(ConfigError) as caught:
         OutputFiles(plot=Path("front.svg")).check()
-    assert "pip install 'recon-cli[plot]'" in caught.value.hint
+    assert install_command("plot") in caught.value.hint
 
 
 def test_a_picture_of_another_format_is_refused() -> None:

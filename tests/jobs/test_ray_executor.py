@@ -15,6 +15,7 @@ from recon_cli.errors import BackendError, WorkspaceError
 from recon_cli.jobs import ray_executor
 from recon_cli.jobs.executor import Command
 from recon_cli.jobs.ray_executor import RayExecutor, _check_node, _choose_resources, _probe
+from recon_cli.machine import install_command
 from recon_cli.workspace.layout import Workspace
 
 ray = pytest.importorskip("ray")
@@ -52,7 +53,7 @@ def test_without_ray_the_error_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setattr(ray_executor, "ray", None)
     with pytest.raises(BackendError, match="not installed") as caught:
         RayExecutor.connect(cores=None, gpu=None, slots=None, folder=tmp_path, inputs=[])
-    assert "pip install 'recon-cli[ray]'" in caught.value.hint
+    assert install_command("ray") in caught.value.hint
 
 
 def test_what_ray_runs_does_not_wait_for_more_of_ray(tmp_path, monkeypatch):
