@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-import shlex
 import sys
 import time
 from collections import UserDict
@@ -22,6 +21,7 @@ from recon_cli.commands.console import CapturedOutput, Failure, Log
 from recon_cli.commands.options import Call, complete, used_variables
 from recon_cli.errors import ExitCode, ReconError, ReconstructionError
 from recon_cli.workspace import disk
+from recon_cli.workspace.paths import is_address
 
 MAX_WIDTH = 100  # columns of a help text on a wide terminal
 
@@ -88,12 +88,10 @@ class _LazyGroup(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            word = args[0]
-            if not (Path(word).suffix or os.path.lexists(word)):
+            if not (Path(args[0]).suffix or os.path.lexists(args[0]) or is_address(args[0])):
                 raise
             raise console.HintedUsageError(
-                f"{word} is not a command.",
-                hint=f"To reconstruct it, type `recon run {shlex.quote(word)}`.") from error
+                f"{args[0]} is not a command.", hint=hints.suggest_command("", args)) from error
 
     def list_commands(self, _ctx: click.Context) -> list[str]:
         """Returns the verbs."""
@@ -132,7 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     call = Call()
 
     def complete_commands(text: str) -> str:
-        return hints.name_workspace(text, call.workspace, _default_workspace)
+        return hints.name_workspace(
+            hints.name_verb(text, _verb(words)), call.workspace, _default_workspace)
 
     with console.show_log(call, complete=complete_commands) as log:
         failure, code = None, int(ExitCode.DONE)

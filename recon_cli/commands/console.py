@@ -203,8 +203,8 @@ def result_object(
 class HintedUsageError(click.UsageError):
     """A wrong command line, with what to type instead."""
 
-    def __init__(self, message: str, *, hint: str) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, *, hint: str, ctx: click.Context | None = None) -> None:
+        super().__init__(message, ctx)
         self.hint = hint
 
 

@@ -9,8 +9,10 @@ from pathlib import Path
 from recon_cli.capture import from_photos, from_video
 from recon_cli.capture.archives import refuse_other_file
 from recon_cli.capture.foreign import FOREIGN, find_foreign
+from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import IngestedSource, merge_sources
+from recon_cli.capture.photo_tree import find_photo_files, find_videos
 from recon_cli.capture.spherical_video import refuse_unstitched
 from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
@@ -118,7 +120,7 @@ def _ingest(
         refuse_incomplete(path)
         if not _is_photos(path):
             refuse_other_file(path)
-    parts = _parts(sources)
+    parts = _parts([_find_only_video(path, out, ctx) for path in sources])
     prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
     videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)
               if not _is_photos(part[0])]
@@ -139,6 +141,15 @@ def _ingest(
         else:
             ingested.append(from_photos.ingest(config, part, out, ctx, prefix=prefix))
     return ingested
+
+
+def _find_only_video(path: Path, out: Path, ctx: StageContext) -> Path:
+    """Returns the one video in a folder without enough photos; any other path as it is."""
+    videos = find_videos(path, out) if path.is_dir() else []
+    if len(videos) != 1 or len(find_photo_files(path, out).files) >= MIN_FRAMES:
+        return path
+    ctx.notice(f"{path} holds one video and no photos of a scene: {videos[0].name} is used.")
+    return videos[0]
 
 
 def _tell_many(config: IngestConfig, frames: int, ctx: StageContext) -> None:

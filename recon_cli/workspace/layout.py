@@ -18,7 +18,7 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -81,7 +81,7 @@ class Workspace:
         Raises:
             WorkspaceError: another process holds it, or it cannot be made.
         """
-        is_new = not os.path.lexists(self.root)
+        made = [path for path in (self.root, *self.root.parents) if not os.path.lexists(path)]
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -92,19 +92,21 @@ class Workspace:
             with hold_lock(self.root, verb):
                 self.recover()
                 yield
-        except ReconError:
-            if is_new:
-                self._remove_if_empty()
+        except BaseException:  # a bug and Ctrl-C leave no empty folder either
+            if made:
+                self._remove_if_empty(made)
             raise
 
-    def _remove_if_empty(self) -> None:
-        """Removes a folder that a failed first command made, unless there is work in it."""
-        if not {path.name for path in self.root.iterdir()} <= {LOG, LOCK, HOLDER}:
-            return
-        for name in (LOG, LOCK, HOLDER):
-            (self.root / name).unlink(missing_ok=True)
+    def _remove_if_empty(self, made: Sequence[Path]) -> None:
+        """Removes the folders that a failed first command made, unless there is work in them."""
         with suppress(OSError):  # somebody has put a file there meanwhile
-            self.root.rmdir()
+            with suppress(FileNotFoundError):
+                (self.root / journal.PARTIAL).rmdir()
+            if {path.name for path in self.root.iterdir()} <= {LOG, LOCK, HOLDER}:
+                for name in (LOG, LOCK, HOLDER):
+                    (self.root / name).unlink(missing_ok=True)
+                for folder in made:
+                    folder.rmdir()
 
     def manifest(self, stage: str) -> Manifest | None:
         """Returns the manifest of a stage's result, or None where there is none.
