@@ -15,11 +15,11 @@ from typing import Any
 
 import click
 
-from recon_cli import __version__, signals
+from recon_cli import __version__, machine, signals
 from recon_cli.commands import console, hints
 from recon_cli.commands.console import CapturedOutput, Failure, Log
 from recon_cli.commands.options import Call, complete, used_variables
-from recon_cli.errors import ExitCode, ReconError, ReconstructionError
+from recon_cli.errors import ExitCode, ReconError, WorkspaceError
 from recon_cli.workspace import disk
 from recon_cli.workspace.paths import is_address
 
@@ -51,6 +51,8 @@ VERBS = {
     "study": ("bench.study", "Repeat the paper's experiment: 3DGS against ours."),
 }
 
+# Verbs that load no library of numbers, so that they work in whatever memory there is
+_LIGHT = ("status", "clean")
 # Verbs that recon types itself
 HIDDEN = {"map-segment": "segments.map_segment", "train-block": "train_block.train_block"}
 
@@ -84,7 +86,14 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Returns the verb that was typed; where it is a capture, the error says what to type."""
+        """Returns the verb that was typed; where it is a capture, the error says what to type.
+
+        WorkspaceError without a current folder, ReconstructionError without memory for libraries.
+        """
+        if not ctx.resilient_parsing and not {"-h", "--help", "--help-all"}.intersection(args):
+            _refuse_lost_folder()
+            if args[0] not in _LIGHT:
+                machine.refuse_low_limit()
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
@@ -152,6 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             code = _print_object(console.result_object(
                 _verb(words), str(call.workspace.absolute()) if known else None, log, lines,
                 time.monotonic() - begin, failure), code)
+        console.drop_output()
         return code
 
 
@@ -172,8 +182,10 @@ def _print_object(text: str, code: int) -> int:
     try:
         click.echo(text)
     except BrokenPipeError:
-        console.silence()
         return ExitCode.BROKEN_PIPE
+    except WorkspaceError as error:
+        click.echo(Failure(error.message, error.hint, code).text(), err=True)
+        return code or error.exit_code
     return code
 
 
@@ -186,7 +198,6 @@ def _tell(
         error.show()
         return None
     if isinstance(error, BrokenPipeError):
-        console.silence()
         return None
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
         failure = Failure(signals.describe_end(_signalled(error)), "", code)
@@ -231,11 +242,23 @@ def _known(error: BaseException) -> ReconError | None:
     """Returns an error that a user can act on; None for a bug."""
     if isinstance(error, ReconError):
         return error
-    if isinstance(error, MemoryError):
-        return ReconstructionError(
-            f"There is not enough memory: {error or 'none is free'}.",
-            hint="Close other programs, or lower --max-gaussians, --max-size or --frames.")
-    return disk.explain(error, Path.cwd(), "writing") or disk.explain_outside(error)
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:  # it went away while the command ran
+        here = Path(os.sep)
+    return (machine.explain_memory(error) or disk.explain(error, here, "writing")
+            or disk.explain_outside(error))
+
+
+def _refuse_lost_folder() -> None:
+    """Raises WorkspaceError where the current folder was deleted, or its disk taken out."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise WorkspaceError(
+            f"The current folder is gone: {error.strerror}.",
+            hint="Go to a folder that exists, for example by `cd`, and type the command again."
+        ) from error
 
 
 def _signalled(error: BaseException) -> BaseException | None:

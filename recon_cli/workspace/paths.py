@@ -41,7 +41,7 @@ def refuse_special(path: Path, *, command: str = "") -> None:
     if is_address(str(path)):
         name = shlex.quote(path.name) if path.suffix else "FILE"
         raise ConfigError(
-            f"{str(path).replace(':/', '://', 1)} is an address, but recon reads files of this machine only.",
+            f"{str(path).replace(':/', '://', 1)} is an address, but recon reads files only.",
             hint=f"Download it, then {f'type `{command} {name}`' if command else 'give the file'}.")
     try:
         kind = describe_special(path)
