@@ -44,6 +44,7 @@ LOCK = ".lock"  # dropped by the system when its holder dies
 HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
 BLOCKS = "blocks"  # workspaces that `recon train --blocks` made before it was one stage
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
+RENDERS = "render"  # folders of `recon render`, whose frames are kept to resume
 _OLD = ".old"  # results that were replaced
 
 logger = logging.getLogger("recon")
@@ -269,6 +270,11 @@ class Workspace:
         return [*(path for parent in parents
                   for path in ([parent] if parent.is_symlink() else sorted(parent.glob("*")))),
                 *(path for path in sorted(self.root.glob(LEFTOVERS)) if not _is_in_use(path))]
+
+    def renders(self) -> list[Path]:
+        """Returns the folders of frames that `recon render` made in here."""
+        return [path for path in _folders(self.root / RENDERS)
+                if (path / "render.json").is_file() and not has_link(path, self.root)]
 
     def _refuse_foreign(self, stage: str) -> None:
         """Refuses to replace a folder that is not ours: -w may point anywhere."""
