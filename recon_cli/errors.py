@@ -104,7 +104,8 @@ def list_names(names: Sequence[str], most: int = 5) -> str:
 
 def format_count(number: int, noun: str) -> str:
     """Returns a number with its noun in singular or plural."""
-    return f"{number:,} {noun}{'s' * (number != 1)}"
+    ending = "" if number == 1 else "es" if noun.endswith(("ch", "x")) else "s"
+    return f"{number:,} {noun}{ending}"
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:

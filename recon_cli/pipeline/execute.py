@@ -27,6 +27,7 @@ from recon_cli.workspace.digests import Source, digest_file, digest_outputs, rea
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import NAME as MANIFEST
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, RunRecord
+from recon_cli.workspace.records import name_photos
 from recon_cli.workspace.summaries import JsonRecord
 
 _RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
@@ -93,13 +94,15 @@ def run_stage(
         workspace.discard(row.name)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
+    rename = name_photos(inputs.folders["ingest"]) if "ingest" in inputs.folders else str
     with machine.Meter() as meter, in_stage(row.name), _discard_if_useless(
-            workspace, row, earlier):
+            workspace, row, earlier), _naming_photos(rename):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
         run_it = import_module(row.module).run
         with importing_ahead(job) as while_idle:
             summary: JsonRecord = run_it(
-                config, inputs, out, dataclasses.replace(ctx, while_idle=while_idle))
+                config, inputs, out,
+                dataclasses.replace(ctx, while_idle=while_idle, name_photos=rename))
     outputs = workspace.seal(row.name, without=summary.not_recorded())
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
@@ -178,6 +181,17 @@ def _load_quietly(row: Stage, compute: ComputeConfig) -> None:
         if (registry.renders_on_cpu(compute.backend, compute.device)
                 and not registry.kernels_to_compile("numba")):
             registry.prepare("numba", lambda: None)
+
+
+@contextmanager
+def _naming_photos(rename: Callable[[str], str]) -> Iterator[None]:
+    """Names photos in the errors of a stage as its notices do."""
+    try:
+        yield
+    except ReconError as error:
+        error.message, error.hint = rename(error.message), rename(error.hint)
+        error.args = (error.message,)
+        raise
 
 
 @contextmanager

@@ -324,10 +324,11 @@ def _write(
         note += (f"compact minus original: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
                  f"{differences['ssim'].text('+.4f')} (95% by bootstrap over the views)\n")
     first = model_table(by_label)
-    write_text(out / "table.txt", f"{first.text(rule=True)}\n{note}")
+    rename = evaluation.ctx.name_photos
+    write_text(out / "table.txt", rename(f"{first.text(rule=True)}\n{note}"))
     views = view_table(by_label)
-    write_text(out / "metrics.md",
-               f"{first.markdown()}\n{views.markdown()}\n{CONVENTION_LINES}{note}")
+    write_text(out / "metrics.md", rename(
+        f"{first.markdown()}\n{views.markdown()}\n{CONVENTION_LINES}{note}"))
     write_text(out / "metrics.csv", csv_table(models))
     tex = first.latex()
     if len(models) == 2:

@@ -18,7 +18,7 @@ from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.datasets import from_data_set
 from recon_cli.datasets.layouts import recognise, refuse_incomplete
-from recon_cli.errors import InputError
+from recon_cli.errors import InputError, format_count
 from recon_cli.io.tracks import TRACKS
 from recon_cli.sfm.segments import MOST_UNSPLIT
 from recon_cli.workspace import records as store
@@ -87,7 +87,8 @@ def _choose_held_out(
         return store.choose_held_out(
             [frame.name for frame in source.frames], parse_holdout(config.holdout))
     held_out = frozenset(frame.name for frame in source.frames if frame.held_out)
-    ctx.notice(f"The data set itself holds out {len(held_out)} views; --holdout has no effect.")
+    ctx.notice(f"The data set itself holds out {format_count(len(held_out), 'view')}; --holdout "
+               "has no effect.")
     return held_out
 
 
