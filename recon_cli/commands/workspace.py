@@ -21,7 +21,6 @@ from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.stages import STAGES
 from recon_cli.workspace.layout import Workspace, size_of
 from recon_cli.workspace.manifest import describe_progress
-from recon_cli.workspace.records import name_photos
 
 logger = logging.getLogger("recon")
 
@@ -46,11 +45,11 @@ def status(call: Call, as_json: bool) -> None:
     if not job.workspace.root.exists():
         logger.warning("no workspace at %s yet", job.workspace.root)
     click.echo(status_table(stages))
-    rename = name_photos(job.workspace.folder("ingest"))
     for stage in stages:
-        if stage.state == "fresh":
-            for line in stage.summary.get("poorly_seen") or ():
-                click.echo(rename(line))
+        if stage.state == "fresh" and (lines := stage.summary.get("poorly_seen")):
+            from recon_cli.workspace.records import name_photos  # imports numpy
+
+            click.echo(name_photos(job.workspace.folder("ingest"))("\n".join(lines)))
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)
     _offer("--renders", job.workspace.renders(), job.workspace)

@@ -58,7 +58,7 @@ from recon_cli.workspace.atomic import (
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.journal import crc32
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
-from recon_cli.workspace.records import list_photos, read_frame_list
+from recon_cli.workspace.records import find_frames
 
 RECORD = "render.json"
 PATH = "camera_path.json"
@@ -174,7 +174,8 @@ def render_frames(request: RenderRequest, job: Job) -> str:
     with disk_errors(job.workspace.root, "reading the model"):
         trained = open_trained_scene(job, request.model)
         if request.views:
-            request = replace(request, views=_frames_of(request.views, job))
+            request = replace(request, views=find_frames(
+                job.workspace.folder("ingest"), request.views))
     plan = plan_cameras(request, trained)
     encoding = _check(request, plan)
     ctx = render_context(job.compute, job.progress)
@@ -204,15 +205,6 @@ def render_frames(request: RenderRequest, job: Job) -> str:
         "rendered now" + f"; {format_megabytes(layout.size_of(frames.root))} are kept to continue "
         "from, `recon clean --renders` frees them" * kept,
         *map(str, files)])
-
-
-def _frames_of(views: Sequence[str], job: Job) -> tuple[str, ...]:
-    """Returns views by the names of their frames, where photos are given by those of their files.
-    """
-    ingest = job.workspace.folder("ingest")
-    photos = list_photos(read_frame_list(ingest).frames) if ingest.is_dir() else {}
-    frames = {photo: name for name, photo in photos.items()}
-    return tuple(frames.get(view, view) for view in views)
 
 
 def _check(request: RenderRequest, plan: CameraPlan) -> VideoEncoding | None:

@@ -59,6 +59,10 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     mapped = earlier is not None and parts.take_over(
         earlier.folder, earlier.summary, earlier.changed | earlier.missing, out)
     known = read_poses(poses) if poses.exists() else None
+    scale_between = config.scale_between
+    if scale_between is not None:
+        a, b = store.find_frames(ingest, scale_between[:2])
+        scale_between = (a, b, scale_between[2])
     job = MappingJob(
         frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER, out=out.resolve(),
         groups=_groups(frames, config.camera_model),
@@ -68,13 +72,13 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         tracks=tracks if tracks.exists() else None, pairs=config.pairs,
         max_features=config.max_features, min_registered=config.min_registered,
         accept_weak=config.accept_weak, partial=config.partial, gravity=config.gravity == "auto",
-        scale_between=config.scale_between, part=config.part,
+        scale_between=scale_between, part=config.part,
         max_minutes=_time_limit(config, frames), seed=config.seed, threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
         times=_times(frames, tracks))
     _check_frames(job)
-    for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
+    for place in (scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
     if not mapped:
         _tell_time(config, job, ctx)

@@ -123,6 +123,22 @@ def name_photos(ingest: Path) -> Callable[[str], str]:
     return lambda text: _FRAME_NAME.sub(lambda found: photos.get(found[0], found[0]), text)
 
 
+def find_frames(ingest: Path, words: Sequence[str]) -> tuple[str, ...]:
+    """Returns words in which a photo, alone or before ":u,v", is called as its frame.
+
+    FormatError if the list of frames in the folder is damaged.
+    """
+    if not ingest.is_dir():  # of an imported scene
+        return tuple(words)
+    frames = {photo: name for name, photo in list_photos(read_frame_list(ingest).frames).items()}
+
+    def find(word: str) -> str:
+        front, colon, pixel = word.partition(":")
+        return frames.get(word) or f"{frames.get(front, front)}{colon}{pixel}"
+
+    return tuple(map(find, words))
+
+
 def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[str]:
     """Returns the runs of frames in a row that have one of these names, with their seconds.
 
