@@ -27,7 +27,6 @@ from recon_cli.workspace.digests import Source, digest_file, digest_outputs, rea
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import NAME as MANIFEST
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, RunRecord
-from recon_cli.workspace.records import name_photos
 from recon_cli.workspace.summaries import JsonRecord
 
 _RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
@@ -94,6 +93,8 @@ def run_stage(
         workspace.discard(row.name)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
+    from recon_cli.workspace.records import name_photos  # imports numpy
+
     rename = name_photos(inputs.folders["ingest"]) if "ingest" in inputs.folders else str
     with machine.Meter() as meter, in_stage(row.name), _discard_if_useless(
             workspace, row, earlier), _naming_photos(rename):

@@ -226,7 +226,7 @@ def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
     How a sound model was found, and how sure that is, stands in the log and the report.
     """
     sound = summary.trusted is not False and not (summary.broken or summary.left_out)
-    for sentence in (*_attempts(summary.attempts), *summary.lines, *_movement(summary.poses)):
+    for sentence in (*_attempts(summary.attempts), *summary.lines):
         if sound:
             ctx.tell(sentence, detail=True)
         else:
@@ -234,7 +234,7 @@ def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
     for sentence in (*_describe_parts(summary, frames),
                      *_describe_left_out(summary, frames, named=not sound)):
         ctx.notice(sentence)
-    for sentence in summary.world.sentences:
+    for sentence in (*_movement(summary.poses), *summary.world.sentences):
         ctx.tell(sentence)
 
 
