@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-import shlex
 import sys
 import time
 from collections import UserDict
@@ -16,12 +15,13 @@ from typing import Any
 
 import click
 
-from recon_cli import __version__, signals
+from recon_cli import __version__, machine, signals
 from recon_cli.commands import console, hints
 from recon_cli.commands.console import CapturedOutput, Failure, Log
 from recon_cli.commands.options import Call, complete, used_variables
-from recon_cli.errors import ExitCode, ReconError, ReconstructionError
+from recon_cli.errors import ExitCode, ReconError, WorkspaceError
 from recon_cli.workspace import disk
+from recon_cli.workspace.paths import is_address
 
 MAX_WIDTH = 100  # columns of a help text on a wide terminal
 
@@ -51,6 +51,8 @@ VERBS = {
     "study": ("bench.study", "Repeat the paper's experiment: 3DGS against ours."),
 }
 
+# Verbs that load no library of numbers, so that they work in whatever memory there is
+_LIGHT = ("status", "clean")
 # Verbs that recon types itself
 HIDDEN = {"map-segment": "segments.map_segment", "train-block": "train_block.train_block"}
 
@@ -84,16 +86,21 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Returns the verb that was typed; where it is a capture, the error says what to type."""
+        """Returns the verb that was typed; where it is a capture, the error says what to type.
+
+        WorkspaceError without a current folder, ReconstructionError without memory for libraries.
+        """
+        if not ctx.resilient_parsing and not {"-h", "--help", "--help-all"}.intersection(args):
+            _refuse_lost_folder()
+            if args[0] not in _LIGHT:
+                machine.refuse_low_limit()
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            word = args[0]
-            if not (Path(word).suffix or os.path.lexists(word)):
+            if not (Path(args[0]).suffix or os.path.lexists(args[0]) or is_address(args[0])):
                 raise
             raise console.HintedUsageError(
-                f"{word} is not a command.",
-                hint=f"To reconstruct it, type `recon run {shlex.quote(word)}`.") from error
+                f"{args[0]} is not a command.", hint=hints.suggest_command("", args)) from error
 
     def list_commands(self, _ctx: click.Context) -> list[str]:
         """Returns the verbs."""
@@ -132,7 +139,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     call = Call()
 
     def complete_commands(text: str) -> str:
-        return hints.name_workspace(text, call.workspace, _default_workspace)
+        return hints.name_workspace(
+            hints.name_verb(text, _verb(words)), call.workspace, _default_workspace)
 
     with console.show_log(call, complete=complete_commands) as log:
         failure, code = None, int(ExitCode.DONE)
@@ -153,6 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             code = _print_object(console.result_object(
                 _verb(words), str(call.workspace.absolute()) if known else None, log, lines,
                 time.monotonic() - begin, failure), code)
+        console.drop_output()
         return code
 
 
@@ -173,8 +182,10 @@ def _print_object(text: str, code: int) -> int:
     try:
         click.echo(text)
     except BrokenPipeError:
-        console.silence()
         return ExitCode.BROKEN_PIPE
+    except WorkspaceError as error:
+        click.echo(Failure(error.message, error.hint, code).text(), err=True)
+        return code or error.exit_code
     return code
 
 
@@ -187,7 +198,6 @@ def _tell(
         error.show()
         return None
     if isinstance(error, BrokenPipeError):
-        console.silence()
         return None
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
         failure = Failure(signals.describe_end(_signalled(error)), "", code)
@@ -232,11 +242,23 @@ def _known(error: BaseException) -> ReconError | None:
     """Returns an error that a user can act on; None for a bug."""
     if isinstance(error, ReconError):
         return error
-    if isinstance(error, MemoryError):
-        return ReconstructionError(
-            f"There is not enough memory: {error or 'none is free'}.",
-            hint="Close other programs, or lower --max-gaussians, --max-size or --frames.")
-    return disk.explain(error, Path.cwd(), "writing") or disk.explain_outside(error)
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:  # it went away while the command ran
+        here = Path(os.sep)
+    return (machine.explain_memory(error) or disk.explain(error, here, "writing")
+            or disk.explain_outside(error))
+
+
+def _refuse_lost_folder() -> None:
+    """Raises WorkspaceError where the current folder was deleted, or its disk taken out."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise WorkspaceError(
+            f"The current folder is gone: {error.strerror}.",
+            hint="Go to a folder that exists, for example by `cd`, and type the command again."
+        ) from error
 
 
 def _signalled(error: BaseException) -> BaseException | None:

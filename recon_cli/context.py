@@ -105,7 +105,16 @@ class StageContext:
     scratch: Path | None = None  # folder for files without a name; None: the system's
     compute: ComputeConfig | None = None  # as typed, for work on other machines; None: as here
 
+    name_photos: Callable[[str], str] = str  # calls them in a text by the names of their files
+
     def notice(self, text: str) -> None:
         """Tells the user one line that must not be missed; unprintable characters are escaped."""
-        logger.warning("%s", "".join(
-            one if one.isprintable() else repr(one)[1:-1] for one in text))
+        logger.warning("%s", self._printable(text))
+
+    def tell(self, text: str, *, detail: bool = False) -> None:
+        """Tells the user one line about a run that goes well; a `detail` is for the log and -v."""
+        logger.log(logging.DEBUG if detail else logging.INFO, "%s", self._printable(text))
+
+    def _printable(self, text: str) -> str:
+        return "".join(one if one.isprintable() else repr(one)[1:-1]
+                       for one in self.name_photos(text))

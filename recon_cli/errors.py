@@ -5,7 +5,7 @@ Programming mistakes stay ValueError or AssertionError and leave the CLI with ex
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import IntEnum
 
 
@@ -104,4 +104,13 @@ def list_names(names: Sequence[str], most: int = 5) -> str:
 
 def format_count(number: int, noun: str) -> str:
     """Returns a number with its noun in singular or plural."""
-    return f"{number:,} {noun}{'s' * (number != 1)}"
+    ending = "" if number == 1 else "es" if noun.endswith(("ch", "x")) else "s"
+    return f"{number:,} {noun}{ending}"
+
+
+def causes(error: BaseException) -> Iterator[BaseException]:
+    """Yields an error, its cause, and so on."""
+    at: BaseException | None = error
+    while at is not None:
+        yield at
+        at = at.__cause__ or (None if at.__suppress_context__ else at.__context__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import importlib.util
 import os
@@ -18,6 +19,7 @@ from types import TracebackType
 import psutil
 
 from recon_cli import __version__, cgroups
+from recon_cli.errors import ConfigError, ReconError, ReconstructionError, causes
 
 DISTRIBUTION = "recon-gs"  # `recon-cli` on PyPI is somebody else's, with a command `recon` too
 _PACKAGES = {
@@ -30,6 +32,12 @@ _PACKAGES = {
     "rawpy": "rawpy",
     "scikit-image": "scikit-image",
 }
+# What numpy, OpenCV and torch map when they are imported, and OpenBLAS for each thread: where that
+# is refused, it ends the process by itself, without an exception.
+_LIBRARIES_BYTES, _BLAS_BYTES = 512 << 20, 32 << 20
+_MEMORY_WORDS = (
+    os.strerror(errno.ENOMEM), "failed to map segment", "can't start new thread",
+    "can't allocate memory", "out of memory", "bad_alloc", "bad allocation")
 _CPUINFO = Path("/proc/cpuinfo")
 _LOW_PRIORITY = 5  # of POSIX: a third of the share of others; more, and who waits for it waits long
 _SAMPLE_SECONDS = 0.5  # a sample of all children takes about 5 ms
@@ -111,6 +119,48 @@ def free_memory_bytes() -> int:
     return free if left is None else min(free, left)
 
 
+def _address_limit_bytes() -> int | None:
+    """Returns how much memory this process may map (`ulimit -v`); None without a limit."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def refuse_low_limit() -> None:
+    """Raises ReconstructionError where this process may not map what the libraries need."""
+    limit = _address_limit_bytes()
+    least = _LIBRARIES_BYTES + _BLAS_BYTES * usable_threads()
+    if limit is not None and limit < least:
+        raise _memory_error(f"{least >> 20} MB of address space are needed at least")
+
+
+def explain_memory(error: BaseException) -> ReconError | None:
+    """Returns the error for a want of memory or threads, whoever met it; None for any other.
+
+    Where most of the address space is taken, a library that cannot be loaded may not say why.
+    """
+    for each in causes(error):
+        if isinstance(each, MemoryError) or any(word in str(each) for word in _MEMORY_WORDS):
+            return _memory_error(str(each) or "none is free")
+    limit = _address_limit_bytes()
+    if limit is not None and isinstance(error, (ImportError, OSError, RuntimeError)) and (
+            psutil.Process().memory_info().vms > limit / 2):
+        return _memory_error(str(error))
+    return None
+
+
+def _memory_error(reason: str) -> ReconError:
+    limit = _address_limit_bytes()
+    return ReconstructionError(
+        f"There is not enough memory: {reason.splitlines()[0].rstrip('.')}.",
+        hint="Close other programs, or lower --max-gaussians, --max-size or --frames." if (
+            limit is None) else
+        f"This shell allows a process {limit >> 20} MB of address space: raise `ulimit -v`.")
+
+
 def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
     """Returns the CPU's model name from Linux's /proc/cpuinfo, or from Python elsewhere."""
     if cpuinfo.exists():
@@ -122,15 +172,23 @@ def cpu_model(cpuinfo: Path = _CPUINFO) -> str:
 
 
 def cache_root() -> Path:
-    """Returns the folder of recon's caches: RECON_CACHE_DIR, or the platform's."""
+    """Returns the folder of recon's caches: RECON_CACHE_DIR, or the platform's.
+
+    ConfigError for a user without a home, as containers and services have: a folder that anybody
+    can write is no place for code.
+    """
     folder = os.environ.get("RECON_CACHE_DIR")
     if folder:
         return Path(folder)
+    if os.path.expanduser("~") == "~" and not os.environ.get("XDG_CACHE_HOME"):
+        raise ConfigError(
+            "There is no place for compiled kernels: HOME is not set, and the system does not know "
+            "this user.", hint="Set HOME, or RECON_CACHE_DIR, to a folder that only you can write.")
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches" / "recon"
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "recon" / "cache"
-    return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "recon"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "recon"
 
 
 def yield_to_others() -> None:

@@ -53,7 +53,7 @@ ALLOWED: dict[str, set[str]] = {
     "api": RUN | {"flythrough", "report"},
     "commands": RUN | {"api", "experiments", "flythrough", "report", "viewer"},
     "cli": RUN | {"commands"},
-    "__main__": {"cli", "processes", "signals"},
+    "__main__": {"cli", "errors", "processes", "signals"},
 }
 # Packages that only some parts may import.
 HOMES = {

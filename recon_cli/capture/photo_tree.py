@@ -70,9 +70,16 @@ def find_photo_files(folder: Path, out: Path | None = None) -> PhotoTree:
     notices = (
         *_describe_home(folder, home, walk),
         *_describe_aside(folder, home, walk, [found.row.carries for found in foreign]),
-        *_describe_media(list(dict.fromkeys([folder, home]))),
+        *(_describe_media(list(dict.fromkeys([folder, home]))) if files else ()),
         *(found.notice(folder) for found in foreign))
     return PhotoTree(home, files, tuple(foreign), notices)
+
+
+def find_videos(folder: Path, out: Path | None = None) -> list[Path]:
+    """Returns the videos below a folder; not hidden ones, nor those of workspaces and `out`."""
+    return [*(path for path in _files(folder) if path.suffix.lower() in VIDEO_SUFFIXES),
+            *(video for inner in _subfolders(folder, out) if not inner.is_symlink()
+              for video in find_videos(inner, out))]
 
 
 def _add_beside(walk: _Walk, folder: Path, home: Path, out: Path | None) -> None:
@@ -147,7 +154,8 @@ def _describe_media(folders: Sequence[Path]) -> Iterator[str]:
     if videos:
         names = list_names([path.name for path in videos], _NAMED)
         yield (f"Not used beside photos are videos: {names}. recon ingest "
-               f"{shlex.quote(str(folders[0]))} {shlex.quote(str(videos[0]))} uses both.")
+               f"{shlex.quote(str(folders[0]))} {shlex.quote(str(videos[0]))} uses "
+               f"{'both' if len(videos) == 1 else 'the first, too'}.")
     arrays = [path.name for path in files if path.suffix.lower() in (".exr", ".pfm")]
     if arrays:
         yield (f"Not used are {len(arrays)} pictures of depth or high range: "

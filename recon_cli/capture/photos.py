@@ -13,9 +13,9 @@ from recon_cli.capture.depth_pictures import look_like_depth
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
 from recon_cli.capture.panoramas import choose_projection
-from recon_cli.capture.photo_tree import VIDEO_SUFFIXES
+from recon_cli.capture.photo_tree import find_videos
 from recon_cli.capture.picture_names import picture_kind
-from recon_cli.errors import InputError, list_names
+from recon_cli.errors import InputError, format_count, list_names
 from recon_cli.io.views import evenly_spread
 
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
@@ -157,10 +157,12 @@ def check_count(folder: Path, photos: Sequence[Photo], broken: dict[str, str]) -
 
 def _count_hint(folder: Path) -> str:
     """Returns the input to give instead of a folder with too few photos: a video in it, if any."""
-    videos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES
-                    and path.is_file()) if folder.is_dir() else []
+    videos = find_videos(folder) if folder.is_dir() else []
     if videos:
-        return f"It holds videos: recon ingest {shlex.quote(str(videos[0]))}"
+        named = shlex.quote(str(videos[0]))
+        return (f"It holds {format_count(len(videos), 'video')}: "
+                f"{list_names([path.name for path in videos], _NAMED)}. Type `recon ingest "
+                f"{named}`, or give several that show one room.")
     return ("Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, HEIC, "
             "camera RAW).")
 

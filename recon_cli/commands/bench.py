@@ -13,7 +13,7 @@ import click
 from click.core import ParameterSource
 
 from recon_cli.commands import options
-from recon_cli.commands.options import Call, Command, Decorator, pass_call
+from recon_cli.commands.options import Call, Command, Decorator, Verb, pass_call
 from recon_cli.config import settings
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
@@ -23,6 +23,7 @@ from recon_cli.progress import TqdmProgress
 if TYPE_CHECKING:
     from recon_cli.experiments.study import Design
 
+_option = functools.partial(click.option, cls=options.Option)
 _FILE = options.PathType(dir_okay=False)
 _SCENE = options.PathType()
 
@@ -64,15 +65,15 @@ def _scene_options(function: Command) -> Command:
 
     return options.stack([
         click.argument("more", metavar="[SCENE]...", nargs=-1, type=_SCENE),
-        click.option(
+        _option(
             "--scenes", multiple=True, type=_SCENE, metavar="SCENE...",
             help="Workspaces with cameras, or data sets with poses; the words after it are scenes "
                  "too.  [default: none]"),
-        click.option(
-            "--max-size", type=click.IntRange(min=16), default=600, metavar="N",
+        _option(
+            "--max-size", expert=True, type=click.IntRange(min=16), default=600, metavar="N",
             help="Longest side of the images.  [pixels; default: 600]"),
-        click.option(
-            "--max-gaussians", type=click.IntRange(min=1), default=60_000, metavar="N",
+        _option(
+            "--max-gaussians", expert=True, type=click.IntRange(min=1), default=60_000, metavar="N",
             help="Cap of the count.  [default: 60000]")])(collect)
 
 
@@ -91,19 +92,19 @@ def _output_options(plot: str) -> Decorator:
             return function(*args, outputs=OutputFiles(json_file, plot, markdown), **typed)
 
         return options.stack([
-            click.option("--out", "json_file", type=_FILE,
+            _option("--out", "json_file", type=_FILE,
                          help="Write all figures to FILE, as JSON.  [default: nowhere]"),
-            click.option("--plot", type=_FILE, help=(
+            _option("--plot", type=_FILE, help=(
                 f"{plot} into a .png or .svg; needs matplotlib.  [default: nowhere]")),
-            click.option(
-                "--markdown", type=_FILE,
+            _option(
+                "--markdown", expert=True, type=_FILE,
                 help="Write the tables between the lines `<!-- recon bench: begin -->` and "
                      "`<!-- recon bench: end -->` of FILE.  [default: nowhere]")])(collect)
 
     return decorate
 
 
-class _OldSpelling(click.Command):
+class _OldSpelling(Verb):
     """Takes `--json FILE.json`, as --out was once called: every verb has a --json without FILE."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -119,29 +120,29 @@ class _BenchGroup(_OldSpelling, click.Group):
 
 @click.group(
     "bench", cls=_BenchGroup, invoke_without_command=True, subcommand_metavar="[train ...]")
-@click.option(
+@_option(
     "--scene", type=click.Choice(["room", "small"]), default="room",
     help="room is 100,000 Gaussians at 640x360, small 10,000 at 320x180.  [default: room]")
-@click.option(
-    "--gaussians", type=click.IntRange(min=1), metavar="N",
+@_option(
+    "--gaussians", expert=True, type=click.IntRange(min=1), metavar="N",
     help="How many Gaussians.  [default: of the scene]")
-@click.option("--size", metavar="WxH", help="Size of the image in pixels.  "
-              "[default: of the scene]")
-@click.option(
-    "--sh-degree", type=click.IntRange(0, 3), default=3, metavar="N",
+@_option("--size", expert=True, metavar="WxH", help="Size of the image in pixels.  "
+         "[default: of the scene]")
+@_option(
+    "--sh-degree", expert=True, type=click.IntRange(0, 3), default=3, metavar="N",
     help="Degree of the spherical harmonics.  [default: 3]")
-@click.option(
+@_option(
     "--backend", "backends", multiple=True, metavar="NAME",
     help="Rasterizer to measure; may be repeated.  [default: all that run on the device]")
 @options.compute(without=("backend",))
-@click.option(
-    "--rounds", type=click.IntRange(min=1), metavar="N",
+@_option(
+    "--rounds", expert=True, type=click.IntRange(min=1), metavar="N",
     help="Runs behind each median.  [default: 7, with --quick 2]")
-@click.option(
+@_option(
     "--quick", is_flag=True,
     help="A tiny scene and few rounds: whether it works, not how fast.  [default: off]")
 @_output_options("Draw speed against error")
-@click.option(
+@_option(
     "--compare", type=options.PathType(dir_okay=False), metavar="FILE",
     help="Print the ratio of each figure of an earlier --out FILE to this run's.  "
          "[default: none]")
@@ -176,21 +177,21 @@ def _refuse_own_options(ctx: click.Context) -> None:
 
 @click.command("train", cls=_OldSpelling)
 @_scene_options
-@click.option(
+@_option(
     "--recipes", multiple=True, metavar="NAME,...",
     help="reference, budget, paper, budget-pruned, budget-l1 or budget-degree-1, each with "
          "options of training if wanted: budget+sh_degree=2.  [default: reference,budget]")
-@click.option(
+@_option(
     "--iterations", type=click.IntRange(min=1), metavar="N",
     help="Steps of every run.  [default: 3000]")
-@click.option(
-    "--seconds", type=click.FloatRange(min=0, min_open=True), metavar="X",
+@_option(
+    "--seconds", expert=True, type=click.FloatRange(min=0, min_open=True), metavar="X",
     help="As many steps as fit, by the steps of a short pilot.  [default: --iterations counts]")
-@click.option(
+@_option(
     "--seeds", type=click.IntRange(min=1), default=3, metavar="N",
     help="Runs of each recipe, with seeds 0 to N - 1.  [default: 3]")
-@click.option(
-    "--target-db", "targets_db", multiple=True, type=float, metavar="DB",
+@_option(
+    "--target-db", "targets_db", expert=True, multiple=True, type=float, metavar="DB",
     help="PSNR whose time is reported; may be repeated.  [default: what all runs of a scene "
          "reach]")
 @_output_options("Draw the curves")
@@ -213,24 +214,24 @@ def train(call: Call, /, scenes: SceneOptions, recipes: tuple[str, ...], **typed
 bench.add_command(train)
 
 
-@click.command("study")
+@click.command("study", cls=Verb)
 @_scene_options
-@click.option(
+@_option(
     "--replica", type=options.PathType(file_okay=False), metavar="DIR",
     help="Fill the paper's Tables I and II: DIR holds the rooms of Replica (room0 to room2, "
          "office0 to office4), SCENE are own captures. 3DGS, the paper's prune and ours, at equal "
          "steps, on 200 frames a room; defaults become 30000 steps, 1200 pixels, 400000 "
          "Gaussians and one seed.  [default: none]")
-@click.option(
+@_option(
     "--seeds", type=click.IntRange(min=1), default=5, metavar="N",
     help="Runs of each variant, with seeds 0 to N - 1.  [default: 5]")
-@click.option(
+@_option(
     "--iterations", type=click.IntRange(min=1), default=3000, metavar="N",
     help="Steps of every variant where steps are equal.  [default: 3000]")
-@click.option(
-    "--clock", type=click.Choice(["wall", "cpu"]), default="wall",
+@_option(
+    "--clock", expert=True, type=click.Choice(["wall", "cpu"]), default="wall",
     help="Which seconds are made equal; cpu on a machine that others use too.  [default: wall]")
-@click.option(
+@_option(
     "--out", type=options.PathType(file_okay=False), default=Path("study"),
     help="Folder of finished runs, study.json, study.md and study.svg; runs found there are not "
          "made again.  [default: study]")

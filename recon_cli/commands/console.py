@@ -203,8 +203,8 @@ def result_object(
 class HintedUsageError(click.UsageError):
     """A wrong command line, with what to type instead."""
 
-    def __init__(self, message: str, *, hint: str) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, *, hint: str, ctx: click.Context | None = None) -> None:
+        super().__init__(message, ctx)
         self.hint = hint
 
 
@@ -234,11 +234,12 @@ def _setting(error: click.NoSuchOption) -> str:
     return f"{error.ctx.command_path} sets it by {ways}."
 
 
-def silence() -> None:
-    """Drops pending output: the reader of stdout or stderr is gone."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+def drop_output() -> None:
+    """Drops pending output where the reader of stdout or stderr is gone, or its disk is full."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except BrokenPipeError:
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)

@@ -13,7 +13,7 @@ from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call
 from recon_cli.progress import format_megabytes
 from recon_cli.workspace.export_record import ExportSummary
-from recon_cli.workspace.records import read_frame_list
+from recon_cli.workspace.records import name_photos, read_frame_list
 from recon_cli.workspace.summaries import SfmSummary
 
 
@@ -36,10 +36,11 @@ def end_run(call: Call, *, open_page: bool = False) -> None:
         if path is not None:
             click.echo(f"{name + ':':9}{path} ({format_megabytes(path.stat().st_size)})")
     sfm = job.workspace.manifest("sfm")
+    ingest = job.workspace.folder("ingest")
     quality = read_quality(
         job.workspace.folder("evaluate"), SfmSummary.from_json(sfm.run.summary) if sfm else None,
-        read_frame_list(job.workspace.folder("ingest")).frames)
-    click.echo(f"quality: {quality}")
+        read_frame_list(ingest).frames)
+    click.echo(f"quality: {name_photos(ingest)(str(quality))}")
     click.echo(f"next:    {_next_command(call.workspace, page)}")
     if open_page:
         webbrowser.open((page or report).resolve().as_uri())

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from recon_cli.commands.console import LOG_FORMATS, CapturedOutput, Style
+from recon_cli.commands import hints
+from recon_cli.commands.console import LOG_FORMATS, CapturedOutput, HintedUsageError, Style
 from recon_cli.config.fields import OptionInfo, StageConfig, field_type, member_types, option_info
 from recon_cli.config.settings import (
     Settings,
@@ -77,6 +78,16 @@ class Verb(click.Command):
 
     context_class = _VerbContext
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parses the words after the verb; where there are too many, says what to type instead."""
+        ctx.allow_extra_args = True
+        rest = super().parse_args(ctx, args)
+        if rest and not ctx.resilient_parsing and not isinstance(self, click.Group):
+            raise HintedUsageError(
+                f"{ctx.command_path} does not take {' '.join(rest)}.",
+                hint=hints.suggest_command(ctx.command_path, rest), ctx=ctx)
+        return rest
+
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Returns the options with --help and --help-all as the last ones."""
         params = super().get_params(ctx)
@@ -108,8 +119,8 @@ class PathType(click.Path):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> Any:
-        """Returns the path; FormatError if it is one of those."""
-        refuse_special(Path(value))
+        """Returns the path; FormatError if it is one of those, ConfigError for an address."""
+        refuse_special(Path(value), command=ctx.command_path if ctx else "")
         return super().convert(value, param, ctx)
 
 

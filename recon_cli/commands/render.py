@@ -61,7 +61,7 @@ def _color(
          "(base).")
 @click.option(
     "--format", "form", type=click.Choice(FORMATS),
-    help="mp4 also makes a video of the frames.  [default: png, or mp4 if --out ends in .mp4]")
+    help="Any but png also makes a video of the frames.  [default: as --out ends, else png]")
 @click.option("--fps", type=float, metavar="X",
               help="Frames per second.  [default: those of the file, else 30]")
 @click.option("--seconds", type=float, metavar="X",
@@ -76,14 +76,15 @@ def _color(
     "--background", metavar="R,G,B", callback=_color,
     help="Background colour, 0 to 255.  [default: the scene's own]")
 @click.option("--codec", cls=options.Option, expert=True, type=click.Choice(CODECS),
-              help="Video codec.  [default: h264]")
+              help="Video codec.  [default: h264; webm: av1]")
 @click.option(
     "--crf", cls=options.Option, expert=True, type=int, metavar="N",
     help="Constant rate factor of the video; lower is better and larger.  [default: 18; av1: 28]")
 @click.option(
     "--out", type=options.PathType(), metavar="FOLDER|FILE",
-    help="Folder of the frames, where finished ones are kept; or a file for a single video (.mp4) "
-         "or image (.png).  [default: a folder in render/ of the workspace]")
+    help="Folder of the frames, where finished ones are kept; or a file for a single video (.mp4, "
+         ".mov, .webm, .gif) or image (.png, .jpg, .webp).  [default: a folder in render/ of the "
+         "workspace]")
 @options.compute()
 @options.common()
 @pass_call

@@ -166,10 +166,13 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 @click.option(
     "--label", default="", metavar="TEX",
     help="With ITEM and --form latex: label of the table.  [default: none]")
+@click.option(
+    "--explain", is_flag=True, help="Print below the table what each score means.  [default: off]")
 @options.stage(EvaluateConfig, renders=True)
 @pass_call
 def evaluate(
-    call: Call, items: tuple[Path, ...], seeds: int | None, form: str, caption: str, label: str
+    call: Call, items: tuple[Path, ...], seeds: int | None, form: str, caption: str, label: str,
+    explain: bool,
 ) -> None:
     """Score every model on the held-out views.
 
@@ -180,19 +183,24 @@ def evaluate(
         raise click.UsageError("--caption and --label need ITEM and --form latex.")
     if items and seeds:
         raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
+    if explain and form != "text":
+        raise click.UsageError("--explain stands below a table of --form text.")
     if seeds:
         from recon_cli.experiments.seeds import score_seeds
 
         click.echo(score_seeds(*open_job_with(call, EvaluateConfig), seeds).text(form))
-        return
-    if items:
+    elif items:
         from recon_cli.commands.compare_scores import compare
 
         click.echo(compare(
             lambda path: open_job_with(dataclasses.replace(call, workspace=path), EvaluateConfig),
             call.workspace, items, form, caption=caption, label=label))
-        return
-    run_stages(call, "eval", ["evaluate"])
+    else:
+        run_stages(call, "eval", ["evaluate"])
+    if explain and not call.print_config:
+        from recon_cli.evaluation.metrics import EXPLANATION  # imports torch
+
+        click.echo(EXPLANATION)
 
 
 @verb("export")

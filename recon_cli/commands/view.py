@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import time
@@ -12,13 +13,17 @@ from pathlib import Path
 
 import click
 
-from recon_cli.commands import options
+from recon_cli.commands import hints, options
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.context import TrainCallback
-from recon_cli.errors import ExitCode, InputError
+from recon_cli.errors import ExitCode, InputError, StageError
 from recon_cli.signals import exit_code
 from recon_cli.workspace.layout import Workspace
+
+_SCENES = ("ingest", "train")  # one of them is there once anything was done
+
+logger = logging.getLogger("recon")
 
 
 @verb("view")
@@ -50,6 +55,7 @@ def view(
     workspace = _workspace(call, item)
     if item is not None and workspace is None and model != "auto":
         raise click.UsageError("--model has no effect on a file.")
+    logger.info("opening %s", item if workspace is None else f"the scene of {workspace}")
     from recon_cli.viewer.content import PhotoPairs, load_file, load_workspace
     from recon_cli.viewer.server import serve_scene
     from recon_cli.viewer.trust_tint import TrustTint
@@ -96,6 +102,11 @@ def show_training(call: Call) -> Iterator[TrainCallback]:
 def _workspace(call: Call, item: Path | None) -> Path | None:
     """Returns the workspace to show; None where ITEM is a file."""
     if item is None:
+        if not any(path.is_dir() for path in map(Workspace(call.workspace).folder, _SCENES)):
+            raise StageError(
+                f"There is no scene to view in {call.workspace.absolute()}.",
+                hint="Make one by `recon run VIDEO`, name another workspace by `recon view -w "
+                "DIR`, or give a splat file to `recon view`.")
         return call.workspace
     source = click.get_current_context().get_parameter_source("workspace")
     if source == click.core.ParameterSource.COMMANDLINE:
@@ -107,7 +118,7 @@ def _workspace(call: Call, item: Path | None) -> Path | None:
     if not Workspace(item).holds_results:
         raise InputError(
             f"{item} is neither a workspace nor a splat file.",
-            hint="Give a folder that `recon train` was run in, or a splat file.")
+            hint=hints.suggest_command("", [str(item)]))
     return item
 
 

@@ -46,11 +46,13 @@ def status(call: Call, as_json: bool) -> None:
         logger.warning("no workspace at %s yet", job.workspace.root)
     click.echo(status_table(stages))
     for stage in stages:
-        if stage.state == "fresh":
-            for line in stage.summary.get("poorly_seen") or ():
-                click.echo(line)
+        if stage.state == "fresh" and (lines := stage.summary.get("poorly_seen")):
+            from recon_cli.workspace.records import name_photos  # imports numpy
+
+            click.echo(name_photos(job.workspace.folder("ingest"))("\n".join(lines)))
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)
+    _offer("--renders", job.workspace.renders(), job.workspace)
     _refuse_damaged(job, stages)
 
 
@@ -88,13 +90,18 @@ def status_table(stages: Sequence[StageStatus]) -> str:
     help="Also remove the states midway and at the end of a training; without them a longer one "
          "begins anew, and prune needs `recon train --again`.  [default: off]")
 @click.option(
+    "--renders", is_flag=True,
+    help="Also remove the folders of frames and videos that `recon render` made in the workspace.  "
+         "[default: off]")
+@click.option(
     "--keep-exports", is_flag=True,
     help="Remove all results but the exported files.  [default: off]")
 @click.option("--dry-run", is_flag=True, help="Only list the files and sizes.  [default: off]")
 @options.common()
 @pass_call
 def clean(
-    call: Call, stages: tuple[str, ...], states: bool, keep_exports: bool, dry_run: bool
+    call: Call, stages: tuple[str, ...], states: bool, renders: bool, keep_exports: bool,
+    dry_run: bool,
 ) -> None:
     """Free disk space.
 
@@ -102,20 +109,25 @@ def clean(
     STAGE, removes the results of those stages. Files are listed with their sizes first; exports
     are removed only by `recon clean export`.
     """
-    if stages and (states or keep_exports):
-        raise click.UsageError("STAGE excludes --states and --keep-exports.")
+    if stages and (states or renders or keep_exports):
+        raise click.UsageError("STAGE excludes --states, --renders and --keep-exports.")
     job = Job(Workspace(call.workspace), table=STAGES)  # recon.toml may be damaged
     freed = free_space(
-        job, stages, states=states, keep_exports=keep_exports, dry=dry_run,
+        job, stages, states=states, renders=renders, keep_exports=keep_exports, dry=dry_run,
         show=lambda removals: _list_removals(job, removals))
     outcome = "would be freed" if dry_run else "freed"
     click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
-    more = [] if stages or states or keep_exports else find_states(job)
-    if more:
-        logger.info(
-            "`recon clean --states` frees %s more: %s",
-            format_megabytes(sum(map(size_of, more))),
-            ", ".join(str(path.relative_to(job.workspace.root)) for path in more))
+    if not stages and not keep_exports:
+        _offer("--states", [] if states else find_states(job), job.workspace)
+        _offer("--renders", [] if renders else job.workspace.renders(), job.workspace)
+
+
+def _offer(option: str, paths: Sequence[Path], workspace: Workspace) -> None:
+    """Says what an option of clean would free."""
+    if paths:
+        logger.info("`recon clean %s` frees %s more: %s", option,
+                    format_megabytes(sum(map(size_of, paths))),
+                    ", ".join(str(path.relative_to(workspace.root)) for path in paths))
 
 
 def _list_removals(job: Job, removals: Sequence[Removal]) -> None:

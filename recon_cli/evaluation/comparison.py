@@ -31,7 +31,7 @@ from recon_cli.splats.registry import read_splats
 from recon_cli.workspace.atomic import read_json
 
 _TRANSFORM = "transform.json"  # that an export leaves beside its files
-_NOTE = CONVENTION_LINES + (
+_NOTE = (
     "Differences: paired, bootstrap over the views; only between models that were scored on the "
     "same views.")
 
@@ -116,7 +116,7 @@ def format_comparison(
         return "\n".join([first.latex(caption, label), *(
             table.latex() for table in others)]).rstrip()
     if form == "markdown":
-        return "\n".join(table.markdown() for table in tables) + "\n" + _NOTE
+        return "\n".join(table.markdown() for table in tables) + f"\n{CONVENTION_LINES}{_NOTE}"
     return "\n\n".join(table.text(rule=True) for table in tables) + "\n\n" + _NOTE
 
 

@@ -38,9 +38,13 @@ LPIPS_CONVENTION = "LPIPS 0.1 with AlexNet, of the float render, lower is better
 CONVENTIONS: dict[str, Any] = {  # as JSON files hold them
     "psnr_convention": PSNR_CONVENTION, "psnr_8bit_convention": PSNR_8BIT_CONVENTION,
     "ssim_convention": SSIM_CONVENTION, "ssim_padded_convention": SSIM_PADDED_CONVENTION}
-CONVENTION_LINES = (  # below tables
+CONVENTION_LINES = (  # below tables in Markdown
     f"PSNR: {PSNR_CONVENTION}\nafter gain: {GAIN_CONVENTION}\n8-bit: {PSNR_8BIT_CONVENTION}\n"
-    f"SSIM: {SSIM_CONVENTION}\nSSIM 0-pad: {SSIM_PADDED_CONVENTION}\n")
+    f"SSIM: {SSIM_CONVENTION}\nSSIM 0-pad: {SSIM_PADDED_CONVENTION}\n"
+    f"LPIPS: {LPIPS_CONVENTION}\n")
+EXPLANATION = (  # of all that tables may hold
+    f"{CONVENTION_LINES}masks: {MASK_CONVENTION}\npanoramas: {FACES_CONVENTION}\n"
+    f"vignette: {VIGNETTE_CONVENTION}")
 _MAX_DB = 100.0  # of equal images, which JSON cannot hold
 _LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them: ends in their SHA-256
 _LPIPS_ADDRESS = f"https://download.pytorch.org/models/{_LPIPS_WEIGHTS}"

@@ -34,7 +34,7 @@ from recon_cli.scene.gravity import camera_up, find_gravity, turn_onto
 from recon_cli.scene.similarity import Similarity
 from recon_cli.splats.axes import UP
 from recon_cli.workspace.export_formats import PLAN
-from recon_cli.workspace.records import ImportRecord, has_views
+from recon_cli.workspace.records import ImportRecord, find_frames, has_views
 from recon_cli.workspace.summaries import WorldSummary
 
 _RIGID = 1e-6  # difference of a scale from 1
@@ -116,7 +116,9 @@ def _measure_scale(config: ExportConfig, inputs: StageInputs) -> Measurement | N
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
     points, _ = read_points(sparse / "points3D.bin")
     viewmats = {name: viewmat for name, _, viewmat in read_images(sparse / "images.bin")}
-    return measure(ScaleBetween(*config.scale_between), points, viewmats, read_pinholes(sparse))
+    a, b = find_frames(inputs.folders["ingest"], config.scale_between[:2])
+    return measure(
+        ScaleBetween(a, b, config.scale_between[2]), points, viewmats, read_pinholes(sparse))
 
 
 def _known_sources(world: WorldSummary | None) -> list[ScaleSource]:

@@ -1,8 +1,8 @@
 """The files of a flythrough: colour, 16-bit depth and trust with their colours, alpha, and
 videos of them.
 
-Videos are H.264 or AV1 in an .mp4, through PyAV, tagged as BT.709 of limited range: without the
-tags, players guess from the size of the picture.
+Videos are H.264 or AV1 through PyAV, tagged as BT.709 of limited range: without the tags, players
+guess from the size of the picture. A .gif is Pillow's, which chooses colours for each frame.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import ColorRange, Colorspace
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
+from PIL import Image
 
 from recon_cli.errors import ConfigError
 from recon_cli.flythrough.request import ALPHA, DEPTH, RGB, TRUST
@@ -33,7 +34,7 @@ from recon_cli.scene.camera_paths import visible_depths
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.trust.heat_map import error_steps, heat_colors
-from recon_cli.workspace.atomic import replacing
+from recon_cli.workspace.atomic import replacing, write_bytes
 
 DEPTH_COLOR, TRUST_COLOR = "depth_color", "trust_color"
 # the frames of its video, and of a single picture
@@ -47,6 +48,8 @@ _MIN_ALPHA = 0.5  # a pixel with less has no depth
 _ENDS = (0.02, 0.98)
 _BLUE = 0.08  # of the colour map; colours before that are nearly black
 ENCODERS = {"h264": ("libx264",), "av1": ("libsvtav1", "libaom-av1")}  # the first available
+_QUALITY = 95  # of a .jpg or .webp
+_GIF_MS = 20  # of a frame, at least: browsers show shorter ones for 100 ms
 _BT709 = 1  # in FFmpeg's lists of primaries, transfer functions and matrices alike
 os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 prints its settings to stderr; 1 leaves errors
 
@@ -150,6 +153,7 @@ class VideoEncoding:
     width: int  # in pixels, even
     height: int  # in pixels, even
     fps: float
+    form: str = "mp4"  # of `request.VIDEOS`
 
     @property
     def rate(self) -> Fraction:
@@ -172,6 +176,8 @@ class VideoEncoding:
 
 def check_encoding(encoding: VideoEncoding) -> None:
     """Raises ConfigError without an encoder, or if it rejects this size or rate."""
+    if encoding.form == "gif":
+        return
     encoder = encoding.encoder()
     context = VideoCodecContext.create(encoder, "w")
     assert isinstance(context, VideoCodecContext)
@@ -218,16 +224,41 @@ def encode_video(
     on_frame: Callable[[], None],
 ) -> None:
     """Writes RGB or gray pictures as a video, atomically; `on_frame` is called after each."""
+    def images() -> Iterator[NDArray[np.uint8]]:
+        for picture in pictures:
+            yield read_image(picture, encoding.width, encoding.height)
+            on_frame()
+
+    if encoding.form == "gif":
+        _write_gif(images(), path, encoding.fps)
+        return
+    options = {} if encoding.form == "webm" else {"movflags": "+faststart"}
     with _restore_scheduling(), replacing(path) as temporary, av.open(
-            str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+            str(temporary), "w", format=encoding.form, options=options) as container:
         stream = container.add_stream(encoding.encoder(), rate=encoding.rate)
         assert isinstance(stream, VideoStream)
         _configure(stream.codec_context, encoding)
         stream.codec_context.thread_count = threads
-        for picture in pictures:
-            image = read_image(picture, encoding.width, encoding.height)
+        for image in images():
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24").reformat(
                 format="yuv420p", dst_colorspace=Colorspace.ITU709,
                 dst_color_range=ColorRange.MPEG)))
-            on_frame()
         container.mux(stream.encode(None))
+
+
+def _write_gif(images: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    """Writes an animation without end; browsers play no faster than 50 frames a second."""
+    frames = map(Image.fromarray, images)
+    with replacing(path) as temporary:
+        next(frames).save(temporary, format="GIF", save_all=True, append_images=frames,
+                          duration=max(_GIF_MS, round(1000 / fps)), loop=0)
+
+
+def write_picture(picture: Path, path: Path) -> None:
+    """Writes a finished picture under another name, in the format that its suffix says."""
+    if path.suffix.lower() == picture.suffix:
+        write_bytes(path, picture.read_bytes())
+        return
+    with replacing(path) as temporary, Image.open(picture) as image:
+        image.save(temporary, format=Image.registered_extensions()[path.suffix.lower()],
+                   quality=_QUALITY)

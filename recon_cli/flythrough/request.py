@@ -10,7 +10,11 @@ from recon_cli.errors import ConfigError
 
 TRAINING, ORBIT, TOUR = "training", "orbit", "tour"  # values of --path besides a file
 RGB, DEPTH, ALPHA, TRUST = OUTPUTS = ("rgb", "depth", "alpha", "trust")
-PNG, MP4 = FORMATS = ("png", "mp4")
+PNG = "png"
+# The kinds of video and the codecs of each, the default first; a .gif has no other
+VIDEOS = {"mp4": ("h264", "av1"), "mov": ("h264",), "webm": ("av1",), "gif": ("gif",)}
+FORMATS = (PNG, *VIDEOS)
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")  # of a single view
 FPS, SECONDS = 30.0, 10.0  # defaults
 TOUR_SECONDS, TOUR_SIZE = 60.0, 1280  # of a tour
 _CRF_LIMITS = {"h264": 51, "av1": 63}
@@ -33,10 +37,10 @@ class RenderRequest:
     width: int | None = None  # without size, width and height: the size of training or the file
     height: int | None = None
     background: tuple[int, int, int] | None = None  # RGB, 0 to 255; None is the scene's own
-    form: str | None = None  # png or mp4; None is mp4 if `out` ends in .mp4
-    codec: str | None = None  # h264 or av1; None is h264
+    form: str | None = None  # of FORMATS; None is that of `out`, or png
+    codec: str | None = None  # h264 or av1; None is the first of the format
     crf: int | None = None  # quality of the video, smaller is better
-    out: Path | None = None  # folder, .mp4 or .png; None is a folder in the workspace
+    out: Path | None = None  # folder, video or picture; None is a folder in the workspace
     panorama: bool = False  # each frame shows all directions
 
     def __post_init__(self) -> None:
@@ -60,21 +64,22 @@ class RenderRequest:
     @property
     def out_file(self) -> Path | None:
         """The file that --out names; None if it names a folder."""
-        single = self.out is not None and self.out.suffix.lower() in (".mp4", ".png")
-        return self.out if single else None
+        suffix = "" if self.out is None else self.out.suffix.lower()
+        return self.out if suffix in PICTURES or suffix[1:] in VIDEOS else None
 
     @property
-    def video(self) -> bool:
-        """Whether frames become a video."""
-        if self.form is None:
-            return self.out_file is not None and self.out_file.suffix.lower() == ".mp4"
-        return self.form == MP4
+    def video(self) -> str:
+        """The kind of video that frames become; empty where they do not."""
+        form = self.form
+        if form is None and self.out_file is not None:
+            form = self.out_file.suffix.lower()[1:]
+        return form if form in VIDEOS else ""
 
     @property
     def quality(self) -> tuple[str, int]:
         """Codec and CRF of the video."""
-        codec = self.codec or CODECS[0]
-        return codec, CRF[codec] if self.crf is None else self.crf
+        codec = self.codec or VIDEOS[self.video or "mp4"][0]
+        return codec, CRF.get(codec, 0) if self.crf is None else self.crf
 
     def frames(self) -> int:
         """Returns how many frames a path that is made here has."""
@@ -136,23 +141,38 @@ class RenderRequest:
                 "shape.", hint="Give one of them, or --size.")
 
     def _check_video(self) -> None:
-        codec = self.codec or CODECS[0]
+        codec, _ = self.quality
+        for name in ("codec", "crf"):
+            if getattr(self, name) is not None and self.video in ("", "gif"):
+                raise ConfigError(
+                    f"--{name} has no effect without a video, nor on a .gif.",
+                    hint=f"Add --format mp4, or leave --{name} out.")
+        if self.video and codec not in VIDEOS[self.video]:
+            raise ConfigError(
+                f"A .{self.video} holds {' or '.join(VIDEOS[self.video])}, not {codec}.",
+                hint="Leave --codec out, or give another --format.")
         if self.crf is not None and not 0 <= self.crf <= _CRF_LIMITS[codec]:
             raise ConfigError(
                 f"--crf is {self.crf}; {codec} accepts 0 to {_CRF_LIMITS[codec]}.",
                 hint=f"Give a number in that range; {CRF[codec]} is the default.")
-        if not self.video:
-            for name in ("codec", "crf"):
-                if getattr(self, name) is not None:
-                    raise ConfigError(
-                        f"--{name} has no effect without --format mp4.",
-                        hint=f"Add --format mp4, or leave --{name} out.")
-        file = self.out_file
-        if file is not None and not self.video and DEPTH in self.outputs:
+        self._check_out()
+
+    def _check_out(self) -> None:
+        file, out = self.out_file, self.out
+        if file is None:
+            if out is not None and out.suffix[1:2].isalpha() and not out.is_dir():
+                raise ConfigError(
+                    f"--out names {out.name}, but {out.suffix} cannot be written.",
+                    hint=f"Videos are {', '.join(f'.{form}' for form in VIDEOS)}, single views "
+                    f"{', '.join(PICTURES)}; a folder has no suffix.")
+            return
+        if not self.video and DEPTH in self.outputs:
             raise ConfigError(
                 f"{file} alone would not tell the unit of its depth.",
                 hint="Give a folder with --out; its render.json tells the unit.")
-        if file is not None and (file.suffix.lower() == ".mp4") != self.video:
+        kind = file.suffix.lower()[1:]
+        if kind != self.video if self.video else kind in VIDEOS or (
+                self.form == PNG and kind != PNG):
             raise ConfigError(
-                f"--out names {file.name}, but the format is {'mp4' if self.video else 'png'}.",
+                f"--out names {file.name}, but the format is {self.video or PNG}.",
                 hint="Give a folder, or a file that ends as the format does.")

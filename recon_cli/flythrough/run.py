@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,13 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError, FormatError, WorkspaceError, list_names
+from recon_cli.errors import (
+    ConfigError,
+    FormatError,
+    WorkspaceError,
+    format_count,
+    list_names,
+)
 from recon_cli.flythrough.camera_path import write_camera_path
 from recon_cli.flythrough.camera_plan import CameraPlan, check_frame_memory, plan_cameras
 from recon_cli.flythrough.model_trust import load_trust
@@ -30,12 +36,14 @@ from recon_cli.flythrough.output import (
     depth_scale,
     encode_video,
     write_frame,
+    write_picture,
 )
 from recon_cli.flythrough.panorama import join_faces, render_panorama
-from recon_cli.flythrough.request import DEPTH, TRUST, RenderRequest
+from recon_cli.flythrough.request import DEPTH, TRUST, VIDEOS, RenderRequest
 from recon_cli.flythrough.trained_scene import TrainedScene, open_trained_scene
 from recon_cli.io.images import is_whole_png
 from recon_cli.pipeline.execute import Job, render_context
+from recon_cli.progress import format_megabytes
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -45,14 +53,13 @@ from recon_cli.workspace.atomic import (
     LEFTOVERS,
     clear_leftovers,
     read_json,
-    write_bytes,
     write_json,
 )
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.journal import crc32
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
+from recon_cli.workspace.records import find_frames
 
-FOLDER = "render"  # in the workspace
 RECORD = "render.json"
 PATH = "camera_path.json"
 _SCHEMA = 1  # goes up when a frame changes meaning
@@ -153,7 +160,8 @@ class FrameFolder:
                 (self.root / folder).unlink()
             for picture in (self.root / folder).glob("*.png"):
                 picture.unlink()
-        for path in (*(self.root / f"{output}.mp4" for output in FOLDERS), self.root / PATH):
+        videos = [self.root / f"{output}.{form}" for output in FOLDERS for form in VIDEOS]
+        for path in (*videos, self.root / PATH):
             path.unlink(missing_ok=True)
 
 
@@ -165,6 +173,9 @@ def render_frames(request: RenderRequest, job: Job) -> str:
     """
     with disk_errors(job.workspace.root, "reading the model"):
         trained = open_trained_scene(job, request.model)
+        if request.views:
+            request = replace(request, views=find_frames(
+                job.workspace.folder("ingest"), request.views))
     plan = plan_cameras(request, trained)
     encoding = _check(request, plan)
     ctx = render_context(job.compute, job.progress)
@@ -185,13 +196,14 @@ def render_frames(request: RenderRequest, job: Job) -> str:
         files = _encode_videos(frames, encoding, ctx) if encoding else []
     if request.out_file is not None:
         with disk_errors(request.out_file.absolute().parent, f"writing {request.out_file.name}"):
-            source = files[0] if files else frames.frame_path(
-                VIDEO_FRAMES[frames.outputs[0]], frames.names[0])
-            write_bytes(request.out_file, source.read_bytes())
+            write_picture(files[0] if files else frames.frame_path(
+                VIDEO_FRAMES[frames.outputs[0]], frames.names[0]), request.out_file)
         files = [request.out_file]
-    total = len(frames.names)
+    kept = request.out_file is not None
     return "\n".join([
-        f"{total} frame{'s' * (total != 1)} in {frames.root}, {len(missing)} of them rendered now",
+        f"{format_count(len(frames.names), 'frame')} in {frames.root}, {len(missing)} of them "
+        "rendered now" + f"; {format_megabytes(layout.size_of(frames.root))} are kept to continue "
+        "from, `recon clean --renders` frees them" * kept,
         *map(str, files)])
 
 
@@ -206,14 +218,15 @@ def _check(request: RenderRequest, plan: CameraPlan) -> VideoEncoding | None:
     if not request.video or plan.path is None:
         return None
     codec, crf = request.quality
-    encoding = VideoEncoding(codec, crf, largest.width, largest.height, plan.path.fps or 1.0)
+    encoding = VideoEncoding(
+        codec, crf, largest.width, largest.height, plan.path.fps or 1.0, request.video)
     check_encoding(encoding)
     return encoding
 
 
 def _make_folders(request: RenderRequest, plan: CameraPlan, workspace: Path) -> Path:
     """Returns the folder of the frames; it and the folder of --out exist afterwards."""
-    folder = workspace / FOLDER / f"{plan.name}-{'-'.join(request.outputs)}"
+    folder = workspace / layout.RENDERS / f"{plan.name}-{'-'.join(request.outputs)}"
     if request.out is not None and request.out_file is None:
         folder = request.out.absolute()
     _make_folder(folder)
@@ -292,7 +305,7 @@ def _expect(
 
 def _encode_videos(frames: FrameFolder, encoding: VideoEncoding, ctx: StageContext) -> list[Path]:
     """Returns one video an output, encoded again unless frames and settings are the same."""
-    videos = {output: frames.root / f"{output}.mp4" for output in frames.outputs}
+    videos = {output: frames.root / f"{output}.{encoding.form}" for output in frames.outputs}
     record = frames.read_record()
     if record and record["video"] == asdict(encoding) and all(
             path.is_file() for path in videos.values()):

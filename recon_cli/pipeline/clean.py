@@ -12,7 +12,7 @@ from recon_cli.errors import ManifestError, StageError
 from recon_cli.pipeline.execute import Job
 from recon_cli.stages import Stage
 from recon_cli.workspace.digests import matches
-from recon_cli.workspace.layout import disk_errors, has_link, remove, size_of
+from recon_cli.workspace.layout import disk_errors, has_link, hold_lock, remove, size_of
 
 # Logs are volatile too, but later stages read times from them and they free next to nothing.
 _WORTH_BYTES = 1 << 20
@@ -32,14 +32,16 @@ class Removal:
 
 
 def free_space(
-    job: Job, stages: Sequence[str] = (), *, states: bool = False, keep_exports: bool = False,
-    dry: bool = False, show: Callable[[Sequence[Removal]], None] = lambda _removals: None,
+    job: Job, stages: Sequence[str] = (), *, states: bool = False, renders: bool = False,
+    keep_exports: bool = False, dry: bool = False,
+    show: Callable[[Sequence[Removal]], None] = lambda _removals: None,
 ) -> tuple[Removal, ...]:
     """Removes dispensable files and returns them, after `show`; with `dry` nothing is removed.
 
     That is unfinished work, replaced results and large volatile files; with `states` also those
-    that only continue a stage; with `keep_exports` all results but the exported files. Where
-    `stages` are named it is their results alone. Nothing is removed through a link.
+    that only continue a stage, with `renders` the frames of `recon render`; with `keep_exports` all
+    results but the exported files. Where `stages` are named it is their results alone. Nothing is
+    removed through a link.
 
     Raises:
         StageError: exports are to be kept, but there is none.
@@ -52,8 +54,9 @@ def free_space(
         if keep_exports:
             stages = _all_but_exports(job)
         results = [workspace.folder(stage) for stage in stages]
+        frames = workspace.renders() if renders else []
         others = [] if stages and not keep_exports else [
-            path for path in _spare(job, states=states)
+            path for path in (*_spare(job, states=states), *frames)
             if not any(path.is_relative_to(result) for result in results)]
         removals = tuple(
             Removal(path, size_of(path), path.is_symlink(), _stage_of(job, path))
@@ -64,6 +67,9 @@ def free_space(
         for stage in stages:
             workspace.remove(stage)
         for path in others:
+            if path in frames:  # it has a lock of its own
+                with hold_lock(path, "clean", other="no --renders"):
+                    pass
             remove(path)
     return removals
 

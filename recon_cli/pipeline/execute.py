@@ -18,7 +18,7 @@ from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import EarlierResult, StageContext, StageInputs, TrainCallback
-from recon_cli.errors import ConfigError, ManifestError, ReconError
+from recon_cli.errors import ConfigError, InputError, ManifestError, ReconError
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.progress import NullProgress, Progress, in_stage
@@ -93,13 +93,17 @@ def run_stage(
         workspace.discard(row.name)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
-    with machine.Meter() as meter, in_stage(row.name), _discard_if_not_begun(
-            workspace, row.name):
+    from recon_cli.workspace.records import name_photos  # imports numpy
+
+    rename = name_photos(inputs.folders["ingest"]) if "ingest" in inputs.folders else str
+    with machine.Meter() as meter, in_stage(row.name), _discard_if_useless(
+            workspace, row, earlier), _naming_photos(rename):
         ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
         run_it = import_module(row.module).run
         with importing_ahead(job) as while_idle:
             summary: JsonRecord = run_it(
-                config, inputs, out, dataclasses.replace(ctx, while_idle=while_idle))
+                config, inputs, out,
+                dataclasses.replace(ctx, while_idle=while_idle, name_photos=rename))
     outputs = workspace.seal(row.name, without=summary.not_recorded())
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
@@ -181,14 +185,30 @@ def _load_quietly(row: Stage, compute: ComputeConfig) -> None:
 
 
 @contextmanager
-def _discard_if_not_begun(workspace: Workspace, stage: str) -> Iterator[None]:
-    """Discards the unfinished work of a stage that failed before anything was worth resuming."""
+def _naming_photos(rename: Callable[[str], str]) -> Iterator[None]:
+    """Names photos in the errors of a stage as its notices do."""
     try:
         yield
-    except ReconError:
-        partial = workspace.partial_run(stage)
-        if partial and partial.total == 0:
-            workspace.discard(stage)
+    except ReconError as error:
+        error.message, error.hint = rename(error.message), rename(error.hint)
+        error.args = (error.message,)
+        raise
+
+
+@contextmanager
+def _discard_if_useless(workspace: Workspace, row: Stage, earlier: PartialRun) -> Iterator[None]:
+    """Discards the unfinished work of a stage that failed where nothing is worth resuming.
+
+    That is before it recorded any, or where it read the user's own files for the first time and
+    refused them: the same files would be refused again.
+    """
+    try:
+        yield
+    except ReconError as error:
+        partial = workspace.partial_run(row.name)
+        refused = row.input_metavar and isinstance(error, InputError) and not earlier.total
+        if partial and (partial.total == 0 or refused):
+            workspace.discard(row.name)
         raise
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -48,6 +48,7 @@ from recon_cli.trust.quality import delivered_model
 from recon_cli.workspace import atomic
 from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.layout import disk_errors
+from recon_cli.workspace.records import name_photos
 
 FILE = "report.html"
 _SUFFIXES = (".html", ".htm")
@@ -110,12 +111,21 @@ def build_report(job: Job, folder: Path) -> bytes:
         except FormatError as error:
             damaged = f"The scores are not shown: {error.message}"
     values = _template_values(job, stages, metrics, damaged, folder)
+    rename = name_photos(stages["ingest"].folder)
+    environment = _environment().overlay(
+        finalize=lambda value: rename(value) if (
+            type(value) is str and not value.startswith("data:")) else value)
+
+    def render(gallery: Gallery) -> bytes:
+        data = [_script_data(view, rename(view.name)) for view in gallery.views]
+        return _render_page(environment, values, gallery, data)
+
     views = sum(len(model.views) for model in metrics.models.values()) if metrics else 0
     if not views or metrics is None:
-        return _render_page(values, Gallery())
+        return render(Gallery())
     # rendered once without pictures to know how much room the text leaves
-    text = len(_render_page(values, Gallery())) + _TEXT_PER_VIEW * views
-    return _render_page(values, build_gallery(
+    text = len(render(Gallery())) + _TEXT_PER_VIEW * views
+    return render(build_gallery(
         stages["evaluate"].folder, metrics, MAX_FILE_BYTES - text, job.progress))
 
 
@@ -147,7 +157,7 @@ def _template_values(
     }
 
 
-@cache  # which keeps the templates compiled: a page that is too large is rendered again
+@cache
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
@@ -157,20 +167,23 @@ def _environment() -> Environment:
     return environment
 
 
-def _render_page(values: Mapping[str, Any], gallery: Gallery) -> bytes:
+def _render_page(
+    environment: Environment, values: Mapping[str, Any], gallery: Gallery,
+    data: Sequence[Mapping[str, Any]],
+) -> bytes:
     script = (_HERE / "script.js").read_text(encoding="utf-8")
     # the hash in the content policy lets the browser run this script and no other
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    page = _environment().get_template("report.html.j2").render(
-        **values, gallery=gallery, data=[_script_data(view) for view in gallery.views],
+    page = environment.get_template("report.html.j2").render(
+        **values, gallery=gallery, data=data,
         style=Markup((_HERE / "style.css").read_text(encoding="utf-8")),
         script=Markup(script), script_hash=digest)
     return page.encode(errors="backslashreplace")  # file names need not be UTF-8
 
 
-def _script_data(view: GalleryView) -> dict[str, Any]:
+def _script_data(view: GalleryView, name: str) -> dict[str, Any]:
     return {
-        "name": view.name, "width": view.width, "height": view.height, "masked": view.masked,
+        "name": name, "width": view.width, "height": view.height, "masked": view.masked,
         "models": {key: {
             "render": view.renders[key], "difference": view.differences[key],
             "psnr": round(row.psnr_db, 2), "ssim": round(row.ssim, 4)}

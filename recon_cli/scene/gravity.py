@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.errors import format_count
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.surfaces import Floor, Walls, find_floor, find_walls
 
@@ -122,7 +123,7 @@ class Gravity:
 def find_gravity(points: NDArray[np.float64], viewmats: NDArray[np.float64]) -> Gravity:
     """Returns where up is by points [P, 3] and `viewmats` [C, 4, 4] world to camera."""
     if len(viewmats) < MIN_CAMERAS:
-        return Gravity(None, None, None, f"there are only {len(viewmats)} cameras")
+        return Gravity(None, None, None, f"there are only {format_count(len(viewmats), 'camera')}")
     measured = camera_up(viewmats)
     doubt = _doubt(measured)
     if doubt:

@@ -119,7 +119,8 @@ class ModelVerdict(JsonRecord):
     def lines(self) -> list[str]:
         """Returns a short text for the terminal."""
         head = "trusted" if self.trusted else "not to be trusted"
-        lines = [f"{self.registered} of {self.images} images have a camera; the model is {head}."]
+        lines = [f"{self.registered} of {format_count(self.images, 'image')} "
+                 f"{'has' if self.registered == 1 else 'have'} a camera; the model is {head}."]
         lines += self.problems or self._reassurances()
         lines += [
             f"Step {jump.ratio:.0f} times as long as usual: {jump.before} to {jump.after}."
@@ -127,7 +128,8 @@ class ModelVerdict(JsonRecord):
         missing = list(self.unregistered.items())
         lines += [f"{name} has no camera: {reason}." for name, reason in missing[:MOST_LINES]]
         if len(missing) > MOST_LINES:
-            lines.append(f"{len(missing) - MOST_LINES} more have no camera.")
+            more = len(missing) - MOST_LINES
+            lines.append(f"{more} more {'has' if more == 1 else 'have'} no camera.")
         return lines
 
     def _reassurances(self) -> Iterator[str]:
@@ -266,8 +268,8 @@ def _describe_problems(
     problems = [*_describe_break(cut), *_describe_aliasing(aliasing)]
     if len(parts) > 1:
         sizes = ", ".join(str(len(part)) for part in parts)
-        problems.append(f"The model has {len(parts)} parts, of {sizes} cameras, that share no "
-                        "point.")
+        problems.append(f"The model has {len(parts)} parts, which share no point; cameras in each: "
+                        f"{sizes}.")
     if outliers:
         problems.append("These cameras contradict the matches of their images: "
                         f"{list_names([camera.name for camera in outliers])}.")
@@ -282,16 +284,18 @@ def _describe_drift(loops: Sequence[OpenLoop], cut: ScaleCut | None) -> list[str
     if loops:
         loop = loops[0]
         return [
-            f"{loop.first} and {loop.second} show the same place ({loop.points} points in "
-            f"{loop.pairs} pairs of images match), but the model contains it twice, with scales "
+            f"{loop.first} and {loop.second} show the same place "
+            f"({format_count(loop.points, 'point')} in {format_count(loop.pairs, 'pair')} of "
+            "images match), but the model contains it twice, with scales "
             f"{abs(loop.scale - 1):.0%} apart and turned by {loop.turn_deg:.0f} degrees: the "
             f"cameras drifted, most likely{where or ' in between'}."]
     if cut is None or is_scale_known(cut):
         return []
     return [
-        f"The scale of the {len(cut.sides[0])} cameras on one side of the cut{where} relative to "
-        f"the {len(cut.sides[1])} others is known to {cut.error:.0%} only, but "
-        f"{MAX_SCALE_ERROR:.0%} is needed: the two sides share too few points that show depth."]
+        f"The scale of {format_count(len(cut.sides[0]), 'camera')} on one side of the cut{where} "
+        f"relative to the {format_count(len(cut.sides[1]), 'other')} is known to {cut.error:.0%} "
+        f"only, but {MAX_SCALE_ERROR:.0%} is needed: the two sides share too few points that show "
+        "depth."]
 
 
 def _describe_still(share: float) -> list[str]:
@@ -328,7 +332,7 @@ def _describe_aliasing(aliasing: VisualAliasing) -> list[str]:
 def _sides(sides: tuple[Names, Names]) -> str:
     first, second = sides
     named = f"{format_count(len(first), 'camera')} ({list_names(first, most=3)})"
-    return f"{named} and the {len(second)} others"
+    return f"{named} and the {format_count(len(second), 'other')}"
 
 
 def find_jumps(evidence: MatchEvidence, times: Mapping[str, float | None]) -> tuple[Jump, ...]:
@@ -399,13 +403,14 @@ def _reason(
     if blur and matches[~placed].sum() <= matches[placed].sum():
         return f"blurred: {blur}"
     if evidence.keypoints[index] < FEW_KEYPOINTS:
-        return f"too few features: {evidence.keypoints[index]} keypoints"
+        return f"too few features: {format_count(int(evidence.keypoints[index]), 'keypoint')}"
     if not placed.any():
-        where = f", only with {len(others)} that have none" if len(others) else ""
+        where = f", only with {len(others)} without one" if len(others) else ""
         also = f"; {blur}" if blur else ""
         return f"no overlap: no verified match with an image that has a camera{where}{also}"
-    return (f"matched but not placed: {matches[placed].sum()} matches to "
-            f"{np.count_nonzero(placed)} images that have a camera")
+    count, images = int(matches[placed].sum()), int(np.count_nonzero(placed))
+    return (f"matched but not placed: {format_count(count, 'match')} to "
+            f"{format_count(images, 'image')} with a camera")
 
 
 def describe_shifted_centres(model: pycolmap.Reconstruction, database: Path) -> list[str]:

@@ -29,7 +29,8 @@ def format_of(path: Path) -> ExportFormat:
     if not found:
         raise FormatError(
             f"{path} is not of a known format of Gaussians.",
-            hint=f"Known are {', '.join(row.ending for row in READABLE)}.")
+            hint=f"Known are {', '.join(row.ending for row in READABLE)}; `recon run` reads videos "
+            "and photos.")
     return max(found, key=lambda row: len(row.ending))  # .compressed.ply before .ply
 
 

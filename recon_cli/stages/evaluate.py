@@ -178,8 +178,9 @@ class _Evaluation:
         masked = sum(view.mask is not None for view in self.held_out)
         faces = sum(view.face_of is not None for view in self.held_out)
         note = (f"{len(self.held_out)} held-out views at {sizes}, "
-                f"{len(self.scene.unregistered_test)} more without a camera\n{CONVENTION_LINES}"
-                f"LPIPS: {f'not measured, {lacking}' if lacking else LPIPS_CONVENTION}\n")
+                f"{len(self.scene.unregistered_test)} more without a camera\n")
+        if lacking:
+            note += f"LPIPS: not measured, {lacking}\n"
         if masked:
             note += f"Masks on {masked} of {len(self.held_out)} views: {MASK_CONVENTION}\n"
         if self.protocol:
@@ -323,9 +324,11 @@ def _write(
         note += (f"compact minus original: PSNR {differences['psnr_db'].text('+.2f')} dB, SSIM "
                  f"{differences['ssim'].text('+.4f')} (95% by bootstrap over the views)\n")
     first = model_table(by_label)
-    write_text(out / "table.txt", f"{first.text(rule=True)}\n{note}")
+    rename = evaluation.ctx.name_photos
+    write_text(out / "table.txt", rename(f"{first.text(rule=True)}\n{note}"))
     views = view_table(by_label)
-    write_text(out / "metrics.md", f"{first.markdown()}\n{views.markdown()}\n{note}")
+    write_text(out / "metrics.md", rename(
+        f"{first.markdown()}\n{views.markdown()}\n{CONVENTION_LINES}{note}"))
     write_text(out / "metrics.csv", csv_table(models))
     tex = first.latex()
     if len(models) == 2:

@@ -9,14 +9,16 @@ from pathlib import Path
 from recon_cli.capture import from_photos, from_video
 from recon_cli.capture.archives import refuse_other_file
 from recon_cli.capture.foreign import FOREIGN, find_foreign
+from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import IngestedSource, merge_sources
+from recon_cli.capture.photo_tree import find_photo_files, find_videos
 from recon_cli.capture.spherical_video import refuse_unstitched
 from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.datasets import from_data_set
 from recon_cli.datasets.layouts import recognise, refuse_incomplete
-from recon_cli.errors import InputError
+from recon_cli.errors import InputError, format_count
 from recon_cli.io.tracks import TRACKS
 from recon_cli.sfm.segments import MOST_UNSPLIT
 from recon_cli.workspace import records as store
@@ -85,7 +87,8 @@ def _choose_held_out(
         return store.choose_held_out(
             [frame.name for frame in source.frames], parse_holdout(config.holdout))
     held_out = frozenset(frame.name for frame in source.frames if frame.held_out)
-    ctx.notice(f"The data set itself holds out {len(held_out)} views; --holdout has no effect.")
+    ctx.notice(f"The data set itself holds out {format_count(len(held_out), 'view')}; --holdout "
+               "has no effect.")
     return held_out
 
 
@@ -118,7 +121,7 @@ def _ingest(
         refuse_incomplete(path)
         if not _is_photos(path):
             refuse_other_file(path)
-    parts = _parts(sources)
+    parts = _parts([_find_only_video(path, out, ctx) for path in sources])
     prefixes = ["" if len(parts) == 1 else f"{index + 1:02d}_" for index in range(len(parts))]
     videos = [(part[0], prefix) for part, prefix in zip(parts, prefixes, strict=True)
               if not _is_photos(part[0])]
@@ -139,6 +142,15 @@ def _ingest(
         else:
             ingested.append(from_photos.ingest(config, part, out, ctx, prefix=prefix))
     return ingested
+
+
+def _find_only_video(path: Path, out: Path, ctx: StageContext) -> Path:
+    """Returns the one video in a folder without enough photos; any other path as it is."""
+    videos = find_videos(path, out) if path.is_dir() else []
+    if len(videos) != 1 or len(find_photo_files(path, out).files) >= MIN_FRAMES:
+        return path
+    ctx.notice(f"{path} holds one video and no photos of a scene: {videos[0].name} is used.")
+    return videos[0]
 
 
 def _tell_many(config: IngestConfig, frames: int, ctx: StageContext) -> None:

@@ -59,6 +59,10 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     mapped = earlier is not None and parts.take_over(
         earlier.folder, earlier.summary, earlier.changed | earlier.missing, out)
     known = read_poses(poses) if poses.exists() else None
+    scale_between = config.scale_between
+    if scale_between is not None:
+        a, b = store.find_frames(ingest, scale_between[:2])
+        scale_between = (a, b, scale_between[2])
     job = MappingJob(
         frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER, out=out.resolve(),
         groups=_groups(frames, config.camera_model),
@@ -68,13 +72,13 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         tracks=tracks if tracks.exists() else None, pairs=config.pairs,
         max_features=config.max_features, min_registered=config.min_registered,
         accept_weak=config.accept_weak, partial=config.partial, gravity=config.gravity == "auto",
-        scale_between=config.scale_between, part=config.part,
+        scale_between=scale_between, part=config.part,
         max_minutes=_time_limit(config, frames), seed=config.seed, threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
         times=_times(frames, tracks))
     _check_frames(job)
-    for place in (config.scale_between or ())[:2]:  # now, not after minutes of mapping
+    for place in (scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
     if not mapped:
         _tell_time(config, job, ctx)
@@ -147,10 +151,11 @@ def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
         segments=number, keyframes=mapped), ctx.threads)
     if seconds is None:
         return
-    near = seconds > NEAR_LIMIT * 60 * job.max_minutes
-    limit = f" of the {job.max_minutes:.3g} that --max-minutes allows" if near else ""
-    ctx.notice(f"The cameras of {len(job.names):,} frames will take about "
-               f"{format_minutes(seconds)}{limit}.")
+    words = f"The cameras of {len(job.names):,} frames will take about {format_minutes(seconds)}"
+    if seconds > NEAR_LIMIT * 60 * job.max_minutes:
+        ctx.notice(f"{words} of the {job.max_minutes:.3g} that --max-minutes allows.")
+    else:
+        ctx.tell(f"{words}.")
 
 
 def _groups(frames: FrameList, model: str) -> tuple[CameraGroup, ...]:
@@ -216,11 +221,21 @@ def _summary(frames: FrameList, runs: segments.SegmentRuns, found: MappingResult
 
 
 def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
-    """Says which mappers were tried, which frames have no camera and which models are not used."""
-    for sentence in (*_attempts(summary.attempts), *summary.lines, *_movement(summary.poses),
-                     *_describe_parts(summary, frames), *_describe_left_out(summary, frames),
-                     *summary.world.sentences):
+    """Says which frames have no camera and which models are not used.
+
+    How a sound model was found, and how sure that is, stands in the log and the report.
+    """
+    sound = summary.trusted is not False and not (summary.broken or summary.left_out)
+    for sentence in (*_attempts(summary.attempts), *summary.lines):
+        if sound:
+            ctx.tell(sentence, detail=True)
+        else:
+            ctx.notice(sentence)
+    for sentence in (*_describe_parts(summary, frames),
+                     *_describe_left_out(summary, frames, named=not sound)):
         ctx.notice(sentence)
+    for sentence in (*_movement(summary.poses), *summary.world.sentences):
+        ctx.tell(sentence)
 
 
 def _attempts(attempts: Sequence[AttemptSummary]) -> Iterator[str]:
@@ -258,8 +273,13 @@ def _describe_parts(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
            "shows what to film to join them.")
 
 
-def _describe_left_out(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
-    """Yields sentences on frames without a camera and on models that are not used."""
+def _describe_left_out(
+    summary: SfmSummary, frames: FrameList, *, named: bool
+) -> Iterator[str]:
+    """Yields sentences on frames without a camera and on models that are not used.
+
+    Where frames are `named` already, the verdict has said which have none, and why.
+    """
     missing, held_out = summary.unregistered, summary.unregistered_held_out
     if summary.left_out:
         left_out = format_count(len(summary.left_out), "frame")
@@ -267,9 +287,9 @@ def _describe_left_out(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
                f"{_stretches(frames, summary.left_out)}.")
     for name, reason in summary.rejected.items():
         yield f"{name} was taken out of the model: {reason}."
-    if missing and not summary.lines:  # the verdict names them, and why
+    if missing and not (named and summary.lines):
         yield (f"Left out without a camera: {len(missing)} of {summary.frames} frames, "
-               f"{_stretches(frames, missing)}.")
+               f"{_stretches(frames, missing)}; `recon report` says why.")
     if missing and any(group.lens is not None and group.lens.is_panorama
                        for group in frames.groups):
         yield JOIN_PANORAMAS

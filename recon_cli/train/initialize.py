@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.errors import TrainingError
+from recon_cli.errors import TrainingError, format_count
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
@@ -45,7 +45,8 @@ def splats_from_points(
     """
     if len(points) <= _NEIGHBOURS:
         raise TrainingError(
-            f"The reconstruction has {len(points)} points; at least 4 are needed to start.",
+            f"The reconstruction has {format_count(len(points), 'point')}; at least 4 are needed "
+            "to start.",
             hint="Film slower with more overlap, then run `recon ingest` again.")
     if len(points) > most:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[:most])

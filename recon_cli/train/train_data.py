@@ -14,7 +14,7 @@ import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError, FormatError, TrainingError
+from recon_cli.errors import ConfigError, FormatError, TrainingError, format_count
 from recon_cli.io import views as view_files
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
@@ -67,7 +67,8 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         dataclasses.replace(view, depth=sensor.depths.get(view.name)) for view in views]
     if len(train) < 2:
         raise TrainingError(
-            f"The masks leave only {len(train)} views to train on; at least 2 are needed.",
+            f"The masks leave only {format_count(len(train), 'view')} to train on; at least 2 are "
+            "needed.",
             hint=view_files.MASK_HINT)
     if ctx.device == "cuda":
         train = [view.page_locked() for view in train]
@@ -254,7 +255,8 @@ def refuse_few_views(scene: Scene) -> None:
     """Raises TrainingError unless there are two views to train on."""
     if len(scene.train) < 2:
         raise TrainingError(
-            f"{len(scene.train)} views are left to train on; at least 2 are needed.",
+            f"Only {format_count(len(scene.train), 'view')} can be trained on; at least 2 are "
+            "needed.",
             hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
 
 

@@ -10,10 +10,9 @@ import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
-from recon_cli.errors import ReconError, WorkspaceError
+from recon_cli.errors import ReconError, WorkspaceError, causes
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _WORDS = {
@@ -31,7 +30,7 @@ _NO_TEMPORARY = "No usable temporary directory"  # of tempfile
 
 def find_space_errno(error: BaseException) -> int | None:
     """Returns the number of the system's error for want of space behind an error, or None."""
-    for each in _causes(error):
+    for each in causes(error):
         if isinstance(each, OSError) and each.errno in (*_FULL, errno.EFBIG):
             return each.errno
         text = str(each)
@@ -79,14 +78,6 @@ def explain_outside(error: BaseException) -> ReconError | None:
     return WorkspaceError(
         f"{os.fsdecode(error.filename)[:_SHOWN]} cannot be opened: {error.strerror}.",
         hint="Check its name, its permissions and its disk.")
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    """Yields an error, its cause, and so on."""
-    at: BaseException | None = error
-    while at is not None:
-        yield at
-        at = at.__cause__ or (None if at.__suppress_context__ else at.__context__)
 
 
 def _fullest(root: Path) -> Path:

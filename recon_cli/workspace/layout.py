@@ -18,7 +18,7 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -44,6 +44,7 @@ LOCK = ".lock"  # dropped by the system when its holder dies
 HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
 BLOCKS = "blocks"  # workspaces that `recon train --blocks` made before it was one stage
 SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
+RENDERS = "render"  # folders of `recon render`, whose frames are kept to resume
 _OLD = ".old"  # results that were replaced
 
 logger = logging.getLogger("recon")
@@ -81,7 +82,7 @@ class Workspace:
         Raises:
             WorkspaceError: another process holds it, or it cannot be made.
         """
-        is_new = not os.path.lexists(self.root)
+        made = [path for path in (self.root, *self.root.parents) if not os.path.lexists(path)]
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -92,19 +93,21 @@ class Workspace:
             with hold_lock(self.root, verb):
                 self.recover()
                 yield
-        except ReconError:
-            if is_new:
-                self._remove_if_empty()
+        except BaseException:  # a bug and Ctrl-C leave no empty folder either
+            if made:
+                self._remove_if_empty(made)
             raise
 
-    def _remove_if_empty(self) -> None:
-        """Removes a folder that a failed first command made, unless there is work in it."""
-        if not {path.name for path in self.root.iterdir()} <= {LOG, LOCK, HOLDER}:
-            return
-        for name in (LOG, LOCK, HOLDER):
-            (self.root / name).unlink(missing_ok=True)
+    def _remove_if_empty(self, made: Sequence[Path]) -> None:
+        """Removes the folders that a failed first command made, unless there is work in them."""
         with suppress(OSError):  # somebody has put a file there meanwhile
-            self.root.rmdir()
+            with suppress(FileNotFoundError):
+                (self.root / journal.PARTIAL).rmdir()
+            if {path.name for path in self.root.iterdir()} <= {LOG, LOCK, HOLDER}:
+                for name in (LOG, LOCK, HOLDER):
+                    (self.root / name).unlink(missing_ok=True)
+                for folder in made:
+                    folder.rmdir()
 
     def manifest(self, stage: str) -> Manifest | None:
         """Returns the manifest of a stage's result, or None where there is none.
@@ -267,6 +270,11 @@ class Workspace:
         return [*(path for parent in parents
                   for path in ([parent] if parent.is_symlink() else sorted(parent.glob("*")))),
                 *(path for path in sorted(self.root.glob(LEFTOVERS)) if not _is_in_use(path))]
+
+    def renders(self) -> list[Path]:
+        """Returns the folders of frames that `recon render` made in here."""
+        return [path for path in _folders(self.root / RENDERS)
+                if (path / "render.json").is_file() and not has_link(path, self.root)]
 
     def _refuse_foreign(self, stage: str) -> None:
         """Refuses to replace a folder that is not ours: -w may point anywhere."""

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
+import re
+import shlex
 import stat
 from pathlib import Path
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import ConfigError, FormatError
 
 _SHOWN = 60  # characters of a name that is too long
+# A drive of Windows is one letter; a `Path` has but one of the two slashes.
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 _KINDS = {
     stat.S_ISFIFO: "a named pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a device",
     stat.S_ISBLK: "a device"}
@@ -23,11 +27,22 @@ def is_plain_file(path: Path) -> bool:
         return False
 
 
-def refuse_special(path: Path) -> None:
+def is_address(text: str) -> bool:
+    """Returns whether a text is the address of something on a network, not a path."""
+    return _ADDRESS.match(text) is not None and not os.path.lexists(text)
+
+
+def refuse_special(path: Path, *, command: str = "") -> None:
     """Raises FormatError unless a path is a file, a folder, or not there.
 
-    A pipe or a device would be waited for, or give bytes without end.
+    A pipe or a device would be waited for, or give bytes without end. ConfigError for an address;
+    its hint names the `command` that takes the path.
     """
+    if is_address(str(path)):
+        name = shlex.quote(path.name) if path.suffix else "FILE"
+        raise ConfigError(
+            f"{str(path).replace(':/', '://', 1)} is an address, but recon reads files only.",
+            hint=f"Download it, then {f'type `{command} {name}`' if command else 'give the file'}.")
     try:
         kind = describe_special(path)
     except OSError as error:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -24,6 +26,8 @@ from recon_cli.scene.camera import Lens, make_lens, panorama_lens
 from recon_cli.workspace import atomic
 from recon_cli.workspace.json_record import JsonRecord
 
+# A frame in a sentence, but not in a path
+_FRAME_NAME = re.compile(r"(?<![\w./\\-])[\w.-]+\.png\b")
 FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = "Run `recon ingest --again`."
 POSES, POINTS = "poses.json", "points.safetensors"
@@ -94,6 +98,45 @@ def read_frame_list(stage: Path) -> FrameList:
             f"{stage / LIST} is damaged: it names files elsewhere, or groups that are missing.",
             hint=AGAIN)
     return found
+
+
+def list_photos(frames: Sequence[Frame]) -> dict[str, str]:
+    """Returns the name of each photo's own file by that of its frame.
+
+    Frames of a video have none, nor do photos whose name another one has.
+    """
+    shared = Counter(frame.source for frame in frames)
+    return {frame.name: frame.source for frame in frames
+            if frame.time_seconds is None and shared[frame.source] == 1}
+
+
+def name_photos(ingest: Path) -> Callable[[str], str]:
+    """Returns a function that calls photos in a text by their own names; `ingest` is the folder.
+
+    Apply it once, and last: a photo may be called as the frame of another one is. Without a list
+    of frames the text stays.
+    """
+    try:
+        photos = list_photos(read_frame_list(ingest).frames)
+    except FormatError:
+        return str
+    return lambda text: _FRAME_NAME.sub(lambda found: photos.get(found[0], found[0]), text)
+
+
+def find_frames(ingest: Path, words: Sequence[str]) -> tuple[str, ...]:
+    """Returns words in which a photo, alone or before ":u,v", is called as its frame.
+
+    FormatError if the list of frames in the folder is damaged.
+    """
+    if not ingest.is_dir():  # of an imported scene
+        return tuple(words)
+    frames = {photo: name for name, photo in list_photos(read_frame_list(ingest).frames).items()}
+
+    def find(word: str) -> str:
+        front, colon, pixel = word.partition(":")
+        return frames.get(word) or f"{frames.get(front, front)}{colon}{pixel}"
+
+    return tuple(map(find, words))
 
 
 def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[str]:

@@ -90,3 +90,87 @@ def test_the_generated_reference_holds_every_verb_and_tells_when_it_is_out_of_da
     text = Path("cli.md").read_text()
     assert all(f"## recon {verb}\n" in text for verb in VERBS)
     assert "--max-gaussians" in text
+
+
+_posix = pytest.mark.skipif(os.name != "posix", reason="shell redirections and limits")
+
+
+def _shell(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Runs a line in which $RECON is the program; descriptors are those of a pipe."""
+    return subprocess.run(
+        ["sh", "-c", line.replace("$RECON", f"'{sys.executable}' -m recon_cli")],
+        env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+
+
+@_posix
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&-", ">&- 2>&- <&-"])
+def test_a_closed_stream_is_no_error(closed: str) -> None:
+    done = _shell(f"$RECON status {closed}; echo $? > code")
+    assert Path("code").read_text() == "0\n"
+    assert "Traceback" not in done.stderr
+
+
+@_posix
+def test_no_file_gets_the_number_of_a_closed_stream() -> None:
+    """What a library prints on number 2 would else end in the file that has it."""
+    code = "import os, sys; from recon_cli.__main__ import open_streams; open_streams(); " \
+        "number = os.open('data', os.O_WRONLY | os.O_CREAT); os.write(2, b'noise'); " \
+        "print(number); sys.stderr.write('more')"
+    done = subprocess.run(
+        ["sh", "-c", f"'{sys.executable}' -c \"{code}\" 2>&-"], capture_output=True, text=True,
+        check=True)
+    assert int(done.stdout) > 2
+    assert Path("data").read_bytes() == b""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
+@pytest.mark.parametrize("words", ["status", "status --json", "clean --json", "--help"])
+def test_a_full_standard_output_is_told_from_a_full_workspace(words: str) -> None:
+    done = _shell(f"$RECON {words} > /dev/full")
+    assert done.returncode == 7
+    assert "error: Standard output cannot be written" in done.stderr
+    assert "The disk is full" not in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@_posix
+def test_a_current_folder_that_is_gone_is_said_but_help_is_given() -> None:
+    done = _shell("mkdir gone; cd gone; rmdir ../gone; $RECON status", PYTHONPATH=str(ROOT))
+    assert done.returncode == 7
+    assert "current folder is gone" in done.stderr
+    done = _shell("mkdir gone; cd gone; rmdir ../gone; $RECON status --help",
+                  PYTHONPATH=str(ROOT))
+    assert done.returncode == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems ignore ulimit -v")
+@pytest.mark.parametrize("limit_kb", [80_000, 300_000])
+def test_too_little_address_space_is_said_before_a_library_ends_the_process(limit_kb: int) -> None:
+    done = _shell(f"ulimit -v {limit_kb}; $RECON doctor")
+    assert done.returncode == 5
+    assert "ulimit -v" in done.stderr
+    assert _shell(f"ulimit -v {limit_kb}; $RECON status").returncode == 0
+
+
+@_posix
+def test_a_user_without_a_home_is_told_to_name_a_folder_for_kernels() -> None:
+    code = """
+import os, pwd
+def unknown(_user):
+    raise KeyError("no such user")
+pwd.getpwuid = unknown
+from recon_cli import cli, machine
+assert cli.main(["status"]) == 0
+from recon_cli.errors import ConfigError
+try:
+    machine.cache_root()
+except ConfigError as error:
+    assert "RECON_CACHE_DIR" in error.hint
+else:
+    raise AssertionError
+os.environ["RECON_CACHE_DIR"] = "mine"
+assert str(machine.cache_root()) == "mine"
+"""
+    done = subprocess.run([sys.executable, "-c", code], env={}, capture_output=True, text=True,
+                          check=False)
+    assert done.returncode == 0, done.stderr

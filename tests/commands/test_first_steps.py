@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+import recon_cli
 from recon_cli.cli import main
 from recon_cli.commands import budget
 from recon_cli.commands.budget import Budget
 from recon_cli.commands.options import Call
-from recon_cli.errors import ReconError
+from recon_cli.errors import ConfigError, ReconError
 from recon_cli.workspace.layout import Workspace
 
 
@@ -32,6 +35,58 @@ def test_a_folder_in_place_of_a_verb_is_too(capsys, tmp_path, monkeypatch):
     Path("photos").mkdir()
     assert main(["photos"]) == 2
     assert "`recon run photos`" in said(capsys)[1]
+
+
+@pytest.mark.parametrize(("words", "code", "typed"), [
+    (["train", "room.mp4"], 2, "`recon run room.mp4`"),
+    (["sfm", "room.mp4"], 2, "`recon ingest room.mp4`"),
+    (["sfm", "a/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg"], 2, "`recon run a`"),
+    (["render", "scene.spz"], 2, "`recon import scene.spz`, then `recon render`"),
+    (["status", "done"], 2, "`recon status -w done`"),
+    (["clean", "--dry-run", "train", "-w", "none"], 0, ""),
+    (["eval", "photos"], 3, "`recon run photos`"),
+    (["view", "photos"], 3, "`recon run photos`"),
+    (["view"], 4, "`recon run VIDEO`"),
+    (["run", "https://a.org/room.mp4"], 2, "`recon run room.mp4`"),
+    (["export", "https://a.org/room.mp4"], 2, "`recon run room.mp4`"),
+    (["https://a.org/b"], 2, "`recon run b`"),
+    (["info", "https://a.org/b.ply"], 2, "`recon info b.ply`"),
+    (["train", "3000"], 2, "`recon train --help`"),
+])
+def test_what_a_verb_does_not_take_is_answered_by_the_command_that_does(
+        capsys, tmp_path, monkeypatch, words, code, typed):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("RECON_WORKSPACE", raising=False)
+    Path("photos").mkdir()
+    Path("done/ingest").mkdir(parents=True)
+    Path("done/ingest/manifest.json").touch()
+    assert main(words) == code
+    assert typed in capsys.readouterr().err
+    assert not Path("workspace").exists()
+
+
+def test_an_address_is_refused_from_python_as_well(tmp_path):
+    with pytest.raises(ConfigError, match=r"https://a\.org/room\.mp4"):
+        recon_cli.Workspace(tmp_path / "ws").ingest("https://a.org/room.mp4")
+    assert not (tmp_path / "ws").exists()
+
+
+def test_view_says_what_it_opens_before_it_imports_what_draws(tmp_path):
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(b"ply")
+    code = f"""
+import logging, sys
+from recon_cli.cli import main
+class Early(logging.Handler):
+    def emit(self, record):
+        assert not {{"torch", "viser", "numba"}} & set(sys.modules)
+        assert {str(scene)!r} in record.getMessage()
+        sys.exit(77)
+logging.getLogger("recon").addHandler(Early(logging.INFO))
+main(["view", {str(scene)!r}])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 77, done.stderr
 
 
 def test_a_misspelt_verb_is_not_taken_for_a_capture(capsys):
@@ -55,6 +110,30 @@ def test_a_first_command_that_fails_leaves_no_folder_but_a_later_one_keeps_it(tm
     folder.mkdir()
     assert main(["run", str(tmp_path / "missing.mp4"), "-w", str(folder)]) == 3
     assert folder.exists()
+
+
+def test_a_capture_that_is_refused_after_it_was_read_leaves_nothing_but_its_parents(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "there").mkdir()
+    folder = tmp_path / "there" / "a" / "b"
+    assert main(["run", str(tmp_path / "photos"), "-w", str(folder)]) == 3
+    assert not list((tmp_path / "there").iterdir())
+
+
+def test_an_interruption_keeps_a_new_folder_only_with_work_in_it(tmp_path):
+    for name, work in (("empty", False), ("begun", True)):
+        workspace = Workspace(tmp_path / name)
+
+        def interrupt(workspace: Workspace = workspace, work: bool = work) -> None:
+            with workspace.writing("run"):
+                workspace.partial("ingest").mkdir(parents=True)
+                if not work:
+                    workspace.partial("ingest").rmdir()
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            interrupt()
+        assert workspace.root.exists() is work
 
 
 def test_a_folder_with_a_file_of_the_user_in_it_is_never_removed(tmp_path):

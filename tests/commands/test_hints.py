@@ -10,6 +10,7 @@ import pytest
 
 import recon_cli
 from recon_cli.cli import HIDDEN, cli, main
+from recon_cli.commands import hints
 from recon_cli.commands.hints import name_workspace
 from recon_cli.commands.options import Call
 
@@ -95,3 +96,10 @@ def test_every_command_in_a_message_is_one_that_recon_understands() -> None:
             if in_hint or not isinstance(error, click.BadOptionUsage | click.BadParameter):
                 wrong.append(f"{place}: `recon {verb}{words}`: {error}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_who_runs_is_told_to_run_another_input_but_not_an_option_of_ingest():
+    text = "Type `recon ingest a.mp4` or recon ingest b; `recon ingest --again`, `recon ingest`."
+    assert hints.name_verb(text, "run") == (
+        "Type `recon run a.mp4` or recon run b; `recon ingest --again`, `recon ingest`.")
+    assert hints.name_verb(text, "ingest") == text

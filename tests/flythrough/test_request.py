@@ -20,13 +20,18 @@ BAD = [
     ({"views": ("test",), "fps": 3.0}, "--fps has no effect"),
     ({"views": ("test",), "form": "mp4"}, "cannot become a video"),
     ({"views": ("test",), "width": 8, "height": 8}, "keep their shape"),
-    ({"crf": 20}, "without --format mp4"),
-    ({"codec": "av1"}, "without --format mp4"),
+    ({"crf": 20}, "without a video"),
+    ({"codec": "av1"}, "without a video"),
     ({"crf": 52, "form": "mp4"}, "0 to 51"),
     ({"crf": -1, "codec": "av1", "form": "mp4"}, "0 to 63"),
     ({"out": Path("a.mp4"), "form": "png"}, "format is png"),
     ({"out": Path("a.png"), "form": "mp4"}, "format is mp4"),
     ({"out": Path("a.mp4"), "outputs": ("rgb", "depth")}, "2 outputs"),
+    ({"out": Path("a.gif"), "form": "webm"}, "format is webm"),
+    ({"out": Path("a.jpg"), "form": "png"}, "format is png"),
+    ({"out": Path("a.webm"), "codec": "h264"}, "holds av1"),
+    ({"out": Path("a.gif"), "crf": 20}, "nor on a .gif"),
+    ({"out": Path("a.xyz")}, r"\.xyz cannot be written"),
     ({"out": Path("a.png"), "outputs": ("depth",)}, "unit of its depth"),
 ]
 
@@ -43,3 +48,17 @@ def test_a_file_that_ends_in_mp4_is_a_video():
     assert RenderRequest(form="mp4", out=Path("folder")).video
     assert RenderRequest(form="mp4", codec="av1").quality == ("av1", 28)
     assert RenderRequest(form="mp4", crf=7).quality == ("h264", 7)
+
+
+def test_a_file_says_the_kind_of_video_and_a_folder_may_have_a_dot():
+    for form, codec in (("mp4", "h264"), ("mov", "h264"), ("webm", "av1"), ("gif", "gif")):
+        request = RenderRequest(out=Path(f"a.{form.upper()}"))
+        assert (request.video, request.quality[0]) == (form, codec)
+    assert RenderRequest(out=Path("a.jpg"), views=("test",)).out_file == Path("a.jpg")
+    for name in (".hidden", "v1.5", "plain"):
+        assert RenderRequest(out=Path(name)).out_file is None
+
+
+def test_a_folder_that_is_there_keeps_its_name(tmp_path):
+    (tmp_path / "walk.v2").mkdir()
+    assert RenderRequest(out=tmp_path / "walk.v2").out_file is None

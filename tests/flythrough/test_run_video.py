@@ -3,8 +3,11 @@
 
 import av
 import numpy as np
+import pytest
+from PIL import Image
 from render_cli import SHORT, render
 
+from recon_cli.cli import main
 from recon_cli.io.images import read_image
 
 
@@ -62,3 +65,41 @@ def test_one_video_or_picture_goes_where_a_file_is_named(copied, tmp_path, capsy
         copied / "render" / "views_000001-rgb" / "rgb" / "000001.png").read_bytes()
     assert render(copied, *SHORT, "--out", tmp_path / "two.png") == 2
     assert "4 frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("form", "codec"), [("webm", ("libdav1d", "av1")), ("mov", ("h264",)),
+                                             ("gif", ("gif",))])
+def test_a_video_is_of_the_kind_that_its_name_says(room, tmp_path, form, codec):
+    file = tmp_path / f"walk.{form}"
+    assert render(room, *SHORT, "--size", "96", "--out", file) == 0
+    with av.open(str(file)) as container:
+        assert container.streams.video[0].codec_context.name in codec
+        assert form in container.format.name
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    stills = sorted((room / "render").glob("*/rgb/*.png"))[:4]
+    assert len(frames) == len(stills) == 4
+    first = read_image(stills[0], frames[0].shape[1], frames[0].shape[0]).astype(int)
+    assert np.abs(frames[0] - first).mean() < 6
+
+
+def test_a_view_is_a_picture_of_the_kind_that_its_name_says(room, tmp_path):
+    for name, kind in (("a.jpg", "JPEG"), ("b.webp", "WEBP")):
+        assert render(room, "--views", "000001", "--out", tmp_path / name) == 0
+        with Image.open(tmp_path / name) as picture:
+            assert picture.format == kind
+
+
+def test_frames_that_stay_are_named_with_their_size_and_can_be_cleaned(copied, tmp_path, capsys):
+    assert render(copied, *SHORT, "--out", tmp_path / "walk.mp4") == 0
+    assert "`recon clean --renders" in capsys.readouterr().out
+    assert main(["status", "-w", str(copied)]) == 0
+    folder, = (copied / "render").iterdir()
+    assert f"render/{folder.name}" in capsys.readouterr().err
+    assert main(["clean", "-w", str(copied)]) == 0
+    assert "`recon clean --renders" in capsys.readouterr().err
+    assert folder.exists()
+    assert main(["clean", "--renders", "-w", str(copied)]) == 0
+    assert f"render/{folder.name}: " in capsys.readouterr().out
+    assert not folder.exists()
+    assert (tmp_path / "walk.mp4").exists()
+    assert main(["clean", "train", "--renders", "-w", str(copied)]) == 2

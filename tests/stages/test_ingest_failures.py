@@ -160,6 +160,28 @@ def test_a_folder_without_photos_is_refused(tmp_path):
         take(tmp_path / "room", tmp_path / "out")
 
 
+def test_the_only_video_of_a_folder_without_photos_is_used(tmp_path, notices):
+    folder = tmp_path / "room"
+    (folder / "DCIM").mkdir(parents=True)
+    write_video(folder / "DCIM" / "walk.mp4", walk(12))
+    (folder / "._walk.mp4").write_bytes(b"of a Mac")
+    write_photos(folder, 1)
+    summary = take(folder, tmp_path / "out")
+    assert (summary.kind, summary.decoded_frames) == ("video", 12)
+    assert any("walk.mp4 is used" in notice for notice in notices())
+
+
+def test_several_videos_of_a_folder_are_left_to_the_user(tmp_path):
+    folder = tmp_path / "room"
+    folder.mkdir()
+    for name in ("a.mp4", "b.mp4"):
+        (folder / name).write_bytes(b"never opened")
+    with pytest.raises(InputError) as caught:
+        take(folder, tmp_path / "out")
+    assert f"`recon ingest {folder / 'a.mp4'}`" in caught.value.hint
+    assert "b.mp4" in caught.value.hint
+
+
 def test_a_folder_of_unreadable_photos_is_refused(tmp_path):
     (tmp_path / "room").mkdir()
     for index in range(5):

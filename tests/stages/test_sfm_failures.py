@@ -1,3 +1,4 @@
+import logging
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -55,7 +56,8 @@ def told_times(tmp_path, monkeypatch, *, frames=300, minutes=58.4, slowness=1.0,
     job = SimpleNamespace(**{
         "out": tmp_path, "names": names, "groups": (CameraGroup(names, 640, 360),), "pairs": "auto",
         "known_poses": False, "tracks": None, "max_minutes": minutes, **changes})
-    sfm._tell_time(SfmConfig(), job, SimpleNamespace(notice=notices.append, threads=2))
+    sfm._tell_time(SfmConfig(), job, SimpleNamespace(
+        notice=notices.append, tell=notices.append, threads=2))
     return notices
 
 
@@ -122,6 +124,7 @@ def told(caplog, **changes):
     names = sorted(f"{index}.png" for index in range(60))
     frames = FrameList("video", (Group("a.mp4", 60, 40),), tuple(
         Frame(name, index / 2, "a.mp4", None, held_out=False) for index, name in enumerate(names)))
+    caplog.set_level(logging.DEBUG, logger="recon")
     sfm._report(replace(summary, **changes), frames, StageContext())
     return caplog.text
 
@@ -144,9 +147,18 @@ def test_frames_without_a_camera_are_told(caplog):
 
 
 def test_where_there_is_a_verdict_it_speaks_of_the_missing_frames(caplog):
-    text = told(caplog, lines=("All but eleven hang together.",))
+    text = told(caplog, lines=("All but eleven hang together.",), verdict={"trusted": False})
     assert "All but eleven hang together." in text
     assert "11 of 60" not in text
+
+
+def test_a_sound_model_gives_no_notice_though_the_log_tells_how_it_was_found(caplog):
+    told(caplog, lines=("60 of 60 images have a camera.", "Weakest cut: 99%."), unregistered=(),
+         verdict={"trusted": True}, attempts=(attempt("tracks"), attempt("relaxed")))
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert "Weakest cut" in caplog.text
+    levels = {record.getMessage(): record.levelno for record in caplog.records}
+    assert levels["Weakest cut: 99%."] == logging.DEBUG, "a terminal shows no jargon"
 
 
 def test_frames_that_were_taken_out_of_the_model_are_told_with_the_reason(caplog):

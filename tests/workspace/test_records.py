@@ -17,6 +17,8 @@ from recon_cli.workspace.records import (
     KnownPoses,
     choose_held_out,
     describe_stretches,
+    find_frames,
+    name_photos,
     prepare_frames_folder,
     read_frame_list,
     read_poses,
@@ -154,3 +156,30 @@ def test_stretches_end_where_a_frame_is_not_named_or_its_video_ends():
     photos = [frame(f"{i}.png", None, f"{i}.jpg") for i in range(3)]
     assert describe_stretches(photos, ["1.png", "2.png"]) == ["1.png to 2.png"]
     assert describe_stretches(photos, []) == []
+
+
+def write_photos(folder):
+    """Photos 2.jpg to 10.jpg, two of one name, one called as a frame is, and a video's frame."""
+    photos = [("000000.png", "2.jpg"), ("000001.png", "10.jpg"), ("000002.png", "000001.png"),
+              ("000003.png", "twice.jpg"), ("000004.png", "twice.jpg")]
+    frames = [Frame(name, None, source, None, held_out=False) for name, source in photos]
+    frames.append(Frame("000005.png", 1.5, "walk.mp4", None, held_out=False))
+    FrameList("mixed", (Group("room", 60, 40),), tuple(frames)).write(folder)
+
+
+def test_photos_in_a_text_are_named_by_their_own_files(tmp_path):
+    write_photos(tmp_path)
+    name = name_photos(tmp_path)
+    assert name("000000.png and 000001.png.") == "2.jpg and 10.jpg."
+    assert name("(000002.png)") == "(000001.png)", "once: not as the frame of that name"
+    same = "000003.png, 000005.png (1.5 s), x000000.png, ingest/frames/000000.png, 000000.png.tmp"
+    assert name(same).startswith("000003.png, 000005.png (1.5 s), x000000.png, "
+                                 "ingest/frames/000000.png")
+    assert name_photos(tmp_path / "none")(same) == same
+
+
+def test_a_photo_is_found_by_its_own_name_alone_or_with_a_pixel(tmp_path):
+    write_photos(tmp_path)
+    assert find_frames(tmp_path, ["2.jpg", "10.jpg:4,5", "000005.png", "test", "0,1,2"]) == (
+        "000000.png", "000001.png:4,5", "000005.png", "test", "0,1,2")
+    assert find_frames(tmp_path / "none", ["2.jpg"]) == ("2.jpg",)
