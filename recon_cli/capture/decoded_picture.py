@@ -26,7 +26,6 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from recon_cli.capture.video_colour import BT2020, WIDE_GAMUTS, Transfer, gray_table, to_srgb
-from recon_cli.errors import InputError
 
 UNSPECIFIED, RESERVED = 2, 3  # codes of H.273
 # Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
@@ -48,11 +47,8 @@ UNSUPPORTED_MATRICES = {
 BWDIF = "mode=send_frame:parity=auto:deint=interlaced"
 # H.273, table 3: the transfer characteristics of HDR.
 TRANSFERS = {16: Transfer.PQ, 18: Transfer.HLG}
-# Kinds of AVStereo3DType whose two views cannot be cut apart, and its flag for right before left.
-INTERWOVEN = {
-    4: "in the squares of a checkerboard", 5: "in the squares of a checkerboard",
-    6: "in alternate rows", 7: "in alternate columns"}
-INVERTED = 1
+LOGARITHMIC = (9, 10)  # H.273, table 3: over a range of 100:1 and 316:1
+INVERTED = 1  # libavutil/stereo3d.h: the view of the right eye comes first
 USUAL_SHAPE = 16 / 9  # of the view of one eye
 # Frames of another size, scaled in parts of whole pixels, keep the shape of a picture this well.
 SAME_SHAPE = 0.02
@@ -71,6 +67,15 @@ class Packing(Enum):
 
     SIDE_BY_SIDE = 1
     TOP_AND_BOTTOM = 2
+    CHECKERBOARD = 4
+    QUINCUNX = 5
+    ROWS = 6
+    COLUMNS = 7
+
+    @property
+    def words(self) -> str:
+        """The name in messages."""
+        return self.name.lower().replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,7 @@ class Tags:
     primaries: int = UNSPECIFIED  # H.273 code
     orientation: Orientation = Orientation()
     packing: Packing | None = None  # None where a frame is one view
+    transfer_code: int = UNSPECIFIED  # H.273
     right_first: bool = False  # the view of the right eye is at the left or at the top
     size: tuple[int, int] | None = None  # to which frames are scaled, as stored; None for their own
 
@@ -139,7 +145,7 @@ def read_tags(stream: VideoStream, frame: av.VideoFrame) -> Tags:
         aspect *= _unsqueeze(frame.width * aspect / frame.height, packing)
     return Tags(
         aspect, TRANSFERS.get(int(context.color_trc)), int(context.color_primaries),
-        nearest_orientation(*_display_matrix(frame)), packing, right_first)
+        nearest_orientation(*_display_matrix(frame)), packing, int(context.color_trc), right_first)
 
 
 def read_side_data(frame: av.VideoFrame, kind: str) -> bytes | None:
@@ -158,16 +164,11 @@ def read_packing(frame: av.VideoFrame) -> tuple[Packing | None, bool]:
     """Returns how a frame holds two views by its tag, and whether the right eye's comes first.
 
     It is the SEI of frame packing (H.264 and HEVC), st3d in MP4, or StereoMode in Matroska.
-    InputError for two views whose rows or columns alternate.
     """
     data = read_side_data(frame, "STEREO3D")
     if data is None:
         return None, False
     kind, flags = struct.unpack_from("=ii", data)
-    if kind in INTERWOVEN:
-        raise InputError(
-            f"The video is 3D: its frames hold the views of both eyes, {INTERWOVEN[kind]}.",
-            hint="Export the view of one eye with the app or program that it comes from.")
     packed = next((one for one in Packing if one.value == kind), None)
     return packed, bool(flags & INVERTED)
 
@@ -236,6 +237,16 @@ class DecodedPicture:
         """Width and height as displayed."""
         width, height = self.square_size
         return (height, width) if self.tags.orientation.transposed else (width, height)
+
+    @property
+    def may_be_log(self) -> bool:
+        """Whether the tags say that the signal is logarithmic, or leave it open as log video does.
+
+        Phones write log (Apple Log and others) with the primaries of BT.2020 and no transfer.
+        """
+        code = self.tags.transfer_code
+        return code in LOGARITHMIC or (
+            self.tags.primaries == BT2020 and code in (0, UNSPECIFIED, RESERVED))
 
     def rgb(self) -> NDArray[np.uint8]:
         """Returns the frame as displayed: upright 8-bit full-range RGB [H, W, 3], HDR as SDR."""

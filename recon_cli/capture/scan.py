@@ -287,9 +287,20 @@ def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> 
         videos = len(video.moving_pictures(container))
     if videos > 1:
         notices.append(f"{path.name} holds {videos} videos: the first that can be decoded is used.")
+    if first.tags.packing is not None:
+        width, height = first.size
+        notices.append(
+            f"{path.name} is 3D video ({first.tags.packing.words}): the view of the left eye is "
+            f"used, {width}x{height} pixels.")
     if first.tags.transfer is not None:
         notices.append(
             f"{path.name} is {first.tags.transfer.value} video: tone-mapped to SDR by one curve.")
+    elif first.may_be_log:
+        notices.append(
+            f"{path.name} does not say how its brightness is stored, as log video (such as Apple "
+            "Log) does, and is read as SDR. If it looks flat, convert it first by the LUT of the "
+            f'camera\'s maker: ffmpeg -i "{path}" -vf lut3d=LUT.cube -crf 16 '
+            f'"{path.stem}-709.mp4"')
     elif first.tags.primaries in WIDE_GAMUTS:
         notices.append(
             f"{path.name} has colours of {WIDE_GAMUTS[first.tags.primaries]}: converted to sRGB.")
@@ -300,8 +311,9 @@ def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> 
     if interlaced:
         notices.append(f"{path.name} is interlaced: {interlaced} frames are deinterlaced.")
     width, height = first.square_size
-    if (width, height) != (first.frame.width, first.frame.height):
+    stored = first.tags.size or (first.frame.width, first.frame.height)
+    if (width, height) != stored and first.tags.packing is None:
         notices.append(
             f"{path.name} has pixels of aspect {first.tags.aspect}: its frames of "
-            f"{first.frame.width}x{first.frame.height} are stretched to {width}x{height}.")
+            f"{stored[0]}x{stored[1]} are stretched to {width}x{height}.")
     return tuple(notices)

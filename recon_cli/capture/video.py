@@ -11,7 +11,7 @@ import mmap
 import re
 import struct
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from recon_cli.capture.decoded_picture import (
     DecodedPicture,
     Gap,
     Orientation,
+    Packing,
     Tags,
     deinterlace,
     read_tags,
@@ -197,7 +198,27 @@ def _read_tags(path: Path, stream: VideoStream, first: av.VideoFrame) -> Tags:
             f"{path} stores its colours as {name}, which cannot be converted here.",
             hint="Convert it first, for example with "
             f'ffmpeg -i "{path}" -vf zscale=matrix={matrix} -crf 16 "{path.stem}-{matrix}.mp4"')
-    return read_tags(stream, first)
+    tags = read_tags(stream, first)
+    if tags.packing not in (None, Packing.SIDE_BY_SIDE, Packing.TOP_AND_BOTTOM):
+        raise InputError(
+            f"{path} is 3D video whose frames weave the views of both eyes together "
+            f"({tags.packing.words}).",
+            hint="Export the view of one eye with the program that it comes from.")
+    return tags
+
+
+def sample_frames(path: Path, count: int) -> list[DecodedPicture]:
+    """Returns up to `count` key frames, spread over the video as far as its index allows."""
+    pictures: list[DecodedPicture] = []
+    with open_video(path) as (container, stream):
+        stream.codec_context.skip_frame = "NONKEY"
+        for place in range(count):
+            with suppress(av.error.FFmpegError, StopIteration):
+                if container.duration:
+                    container.seek(round((place + 0.5) / count * container.duration))
+                frame = next(container.decode(stream))
+                pictures.append(DecodedPicture(frame, _read_tags(path, stream, frame)))
+    return pictures
 
 
 def frames_at(

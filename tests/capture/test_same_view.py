@@ -140,7 +140,7 @@ def test_steps_of_a_walk_whose_exposure_drifts_are_not_one_view():
     assert all(abs(index - stands) <= 2 for index, stands in goes.items())
 
 
-@pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.parametrize(("pattern", "count"), [
     ("fox/images/*.jpg", 50), ("desk_monitors/images/*", 70), ("snowmiku_photos/*.jpg", 97),
     ("walks/bonsai/images/*", 292), ("walks/club_room_lockers/images/*", 170),
