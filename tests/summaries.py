@@ -29,7 +29,7 @@ INGEST = IngestSummary(
     kind="video", declared_frames=20, decoded_frames=20, lost_frames=0, dropped_blurred=0,
     frames=12, held_out=2, groups=1, width=64, height=48)
 DENOISE = DenoiseSummary(
-    mode="auto", filter="joint", frames=12, denoised=0, median_sigma_255=0.5)
+    mode="auto", frames=12, denoised=0, median_sigma_255=0.5)
 TRAIN = TrainSummary(
     iterations=100, gaussians=50, initial_gaussians=20, max_gaussians=60, max_size=48,
     planned_iterations=100, stopped_early_at=None, training_views=9, validation_views=0, width=48,

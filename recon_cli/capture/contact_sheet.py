@@ -38,8 +38,8 @@ PAPER, INK, FAINT = (255, 255, 255), (20, 20, 20), (110, 110, 110)
 # Okabe and Ito (2008): eight colours that people with any colour vision tell apart.
 COLOURS: dict[str, Colour] = {
     Reason.KEPT: (0, 158, 115), HELD_OUT: (0, 114, 178), Reason.BLURRED: (213, 94, 0),
-    Reason.CLIPPED: (20, 20, 20), Reason.DUPLICATE: (204, 121, 167), Reason.CLOSE: (190, 190, 190),
-    Reason.DAMAGED: (240, 228, 66)}
+    Reason.CLIPPED: (20, 20, 20), Reason.DUPLICATE: (204, 121, 167),
+    Reason.EXPOSURE: (230, 159, 0), Reason.CLOSE: (190, 190, 190), Reason.DAMAGED: (240, 228, 66)}
 MOST_OBLONG = 4  # width to height of a cell; a longer picture, such as a panorama, has margins
 
 

@@ -1,8 +1,8 @@
 """A decoded frame as it is displayed: deinterlaced, in sRGB, with square pixels, upright.
 
-Pixels that are not square are stretched along the width, as players do. Of a display matrix the
-nearest of the eight orientations is applied, mirrored ones too; where it stretches, FFmpeg gives
-that as the aspect of the pixels.
+Of 3D video it is the view of the left eye alone. Pixels that are not square are stretched along the
+width, as players do. Of a display matrix the nearest of the eight orientations is applied, mirrored
+ones too; where it stretches, FFmpeg gives that as the aspect of the pixels.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import struct
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 from fractions import Fraction
 from itertools import product
 
@@ -46,6 +47,11 @@ UNSUPPORTED_MATRICES = {
 BWDIF = "mode=send_frame:parity=auto:deint=interlaced"
 # H.273, table 3: the transfer characteristics of HDR.
 TRANSFERS = {16: Transfer.PQ, 18: Transfer.HLG}
+LOGARITHMIC = (9, 10)  # H.273, table 3: over a range of 100:1 and 316:1
+INVERTED = 1  # libavutil/stereo3d.h: the view of the right eye comes first
+USUAL_SHAPE = 16 / 9  # of the view of one eye
+# Frames of another size, scaled in parts of whole pixels, keep the shape of a picture this well.
+SAME_SHAPE = 0.02
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,23 @@ class Gap:
     """A packet that gave no frame; `pts` is its place in the stream's time base, if known."""
 
     pts: int | None
+    other_size: tuple[int, int] | None = None  # of a whole frame, of another shape than the others
+
+
+class Packing(Enum):
+    """How the views of both eyes share a frame; values of AVStereo3DType (libavutil/stereo3d.h)."""
+
+    SIDE_BY_SIDE = 1
+    TOP_AND_BOTTOM = 2
+    CHECKERBOARD = 4
+    QUINCUNX = 5
+    ROWS = 6
+    COLUMNS = 7
+
+    @property
+    def words(self) -> str:
+        """The name in messages."""
+        return self.name.lower().replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -106,28 +129,68 @@ class Tags:
     transfer: Transfer | None = None  # None for SDR
     primaries: int = UNSPECIFIED  # H.273 code
     orientation: Orientation = Orientation()
+    packing: Packing | None = None  # None where a frame is one view
+    transfer_code: int = UNSPECIFIED  # H.273
+    right_first: bool = False  # the view of the right eye is at the left or at the top
+    size: tuple[int, int] | None = None  # to which frames are scaled, as stored; None for their own
 
 
 def read_tags(stream: VideoStream, frame: av.VideoFrame) -> Tags:
     """Returns how the frames of a video stream are to be displayed; `frame` is its first one."""
     context = stream.codec_context
+    # The container's value, else the codec's; 0 where neither has one.
+    aspect = stream.sample_aspect_ratio or Fraction(1)
+    packing, right_first = read_packing(frame)
+    if packing is not None:
+        aspect *= _unsqueeze(frame.width * aspect / frame.height, packing)
     return Tags(
-        # The container's value, else the codec's; 0 where neither has one.
-        stream.sample_aspect_ratio or Fraction(1),
-        TRANSFERS.get(int(context.color_trc)), int(context.color_primaries),
-        nearest_orientation(*_display_matrix(frame)))
+        aspect, TRANSFERS.get(int(context.color_trc)), int(context.color_primaries),
+        nearest_orientation(*_display_matrix(frame)), packing, int(context.color_trc), right_first)
+
+
+def read_side_data(frame: av.VideoFrame, kind: str) -> bytes | None:
+    """Returns the side data of a frame by FFmpeg's name; that of the container is on each frame.
+
+    None without it, and where the frame has some of a kind that PyAV does not know.
+    """
+    try:
+        data = frame.side_data.get(kind)
+    except ValueError:  # PyAV then lists none
+        return None
+    return bytes(data) if isinstance(data, Buffer) else None
+
+
+def read_packing(frame: av.VideoFrame) -> tuple[Packing | None, bool]:
+    """Returns how a frame holds two views by its tag, and whether the right eye's comes first.
+
+    It is the SEI of frame packing (H.264 and HEVC), st3d in MP4, or StereoMode in Matroska.
+    """
+    data = read_side_data(frame, "STEREO3D")
+    if data is None:
+        return None, False
+    kind, flags = struct.unpack_from("=ii", data)
+    packed = next((one for one in Packing if one.value == kind), None)
+    return packed, bool(flags & INVERTED)
+
+
+def _unsqueeze(shape: Fraction, packing: Packing) -> Fraction:
+    """Returns what the width of a pixel must be multiplied by in a frame of width / height `shape`.
+
+    Nothing says whether two views were squeezed to share a frame of the usual shape, or stand in
+    one of twice the size. Taken is what gives a view the shape that is nearer to 16:9.
+    """
+    part = Fraction(1, 2) if packing is Packing.SIDE_BY_SIDE else Fraction(2)
+    squeezed, whole = (abs(math.log(one / USUAL_SHAPE)) for one in (shape, shape * part))
+    return 1 / part if squeezed < whole else Fraction(1)
 
 
 def _display_matrix(frame: av.VideoFrame) -> tuple[float, float, float, float]:
     """Returns a, b, c, d of x' = a x + c y, y' = b x + d y."""
-    try:
-        data = frame.side_data.get("DISPLAYMATRIX")
-    except ValueError:  # PyAV cannot list side data of a kind that it does not know
+    data = read_side_data(frame, "DISPLAYMATRIX")
+    if data is None:  # PyAV gives the angle in any case
         turn = math.radians(frame.rotation)  # counterclockwise; y points down
         return math.cos(turn), -math.sin(turn), math.sin(turn), math.cos(turn)
-    if not isinstance(data, Buffer):
-        return 1, 0, 0, 1
-    a, b, _, c, d = struct.unpack("=5i", bytes(data)[:20])
+    a, b, _, c, d = struct.unpack_from("=5i", data)
     return a, b, c, d
 
 
@@ -140,15 +203,50 @@ class DecodedPicture:
     interlaced: bool = False  # its two fields were taken at different times
 
     @property
+    def _whole_size(self) -> tuple[int, int]:
+        """Width and height with square pixels of all views, before rotation."""
+        width, height = self.tags.size or (self.frame.width, self.frame.height)
+        return max(1, round(width * self.tags.aspect)), height
+
+    @property
+    def _view(self) -> tuple[slice, slice]:
+        """Rows and columns of the picture that count: those of the left eye in 3D video."""
+        width, height = self._whole_size
+        axes = [slice(0, height), slice(0, width)]
+        if self.tags.packing is not None:
+            axis = int(self.tags.packing is Packing.SIDE_BY_SIDE)
+            half = max(1, (height, width)[axis] // 2)
+            axes[axis] = slice(half, 2 * half) if self.tags.right_first else slice(0, half)
+        return axes[0], axes[1]
+
+    @property
     def square_size(self) -> tuple[int, int]:
         """Width and height with square pixels, before rotation."""
-        return max(1, round(self.frame.width * self.tags.aspect)), self.frame.height
+        rows, columns = self._view
+        return columns.stop - columns.start, rows.stop - rows.start
+
+    @property
+    def fits(self) -> bool:
+        """Whether the frame has the shape of those that it is scaled to."""
+        width, height = self.tags.size or (1, 1)
+        shape = self.frame.width * height / (self.frame.height * width)
+        return self.tags.size is None or abs(shape - 1) <= SAME_SHAPE
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height as displayed."""
         width, height = self.square_size
         return (height, width) if self.tags.orientation.transposed else (width, height)
+
+    @property
+    def may_be_log(self) -> bool:
+        """Whether the tags say that the signal is logarithmic, or leave it open as log video does.
+
+        Phones write log (Apple Log and others) with the primaries of BT.2020 and no transfer.
+        """
+        code = self.tags.transfer_code
+        return code in LOGARITHMIC or (
+            self.tags.primaries == BT2020 and code in (0, UNSPECIFIED, RESERVED))
 
     def rgb(self) -> NDArray[np.uint8]:
         """Returns the frame as displayed: upright 8-bit full-range RGB [H, W, 3], HDR as SDR."""
@@ -176,9 +274,11 @@ class DecodedPicture:
     def _reformat(
         self, pixels: str, matrix: Colorspace | None, interpolation: Interpolation | None = None,
     ) -> NDArray[np.generic]:
+        width, height = self._whole_size
+        rows, columns = self._view
         return self.frame.reformat(
-            width=self.square_size[0], format=pixels, src_colorspace=matrix,
-            dst_colorspace=matrix, interpolation=interpolation).to_ndarray()
+            width=width, height=height, format=pixels, src_colorspace=matrix,
+            dst_colorspace=matrix, interpolation=interpolation).to_ndarray()[rows, columns]
 
     def _untagged(self) -> bool:
         return self.frame.colorspace in (UNSPECIFIED, RESERVED)
@@ -198,13 +298,17 @@ class DecodedPicture:
 
 
 def deinterlace(
-    items: Iterable[av.VideoFrame | Gap],  # frames of one size in presentation order, and gaps
+    items: Iterable[av.VideoFrame | Gap],  # frames in presentation order, and gaps
 ) -> Iterator[tuple[av.VideoFrame, bool] | Gap]:
     """Yields each frame deinterlaced and whether it was interlaced; gaps keep their place."""
     deinterlacer: _Deinterlacer | None = None
     for item in items:
-        if deinterlacer is None and isinstance(item, av.VideoFrame) and item.interlaced_frame:
-            deinterlacer = _Deinterlacer(item)
+        if isinstance(item, av.VideoFrame):
+            if deinterlacer is not None and deinterlacer.size != (item.width, item.height):
+                yield from deinterlacer.put(None)
+                deinterlacer = None
+            if deinterlacer is None and item.interlaced_frame:
+                deinterlacer = _Deinterlacer(item)
         if deinterlacer is not None:
             yield from deinterlacer.put(item)
         else:
@@ -217,6 +321,7 @@ class _Deinterlacer:
     """A filter graph, which is one frame late, and the items that wait for it."""
 
     def __init__(self, first: av.VideoFrame) -> None:
+        self.size = (first.width, first.height)
         self._waiting: deque[av.VideoFrame | Gap] = deque()
         self._graph = Graph()
         source = self._graph.add("buffer", ":".join((

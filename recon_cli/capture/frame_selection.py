@@ -2,8 +2,9 @@
 
 From a video: locally sharp frames, spread evenly over the camera's path, one of those that show the
 same picture. Frames that are mostly black or blown out count as blurred; the best of them bridge
-gaps. Photos are all kept, except those that show nothing or the same view as another: where one of
-two equal views is held out, a model is tested on its own training data.
+gaps. Photos are all kept, except those that show nothing or the same view as another, maybe in
+another exposure: where one of two equal views is held out, a model is tested on its own training
+data.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import percentile_filter
@@ -24,9 +24,13 @@ from scipy.ndimage import percentile_filter
 from recon_cli.capture.frame_measures import (
     check_exposure,
     has_content,
-    measure_exposure,
-    measure_sharpness,
     well_exposed,
+)
+from recon_cli.capture.same_view import (
+    PhotoMeasures,
+    compare_brightness,
+    find_repeats,
+    is_same_view,
 )
 from recon_cli.errors import InputError, list_names
 from recon_cli.workspace import atomic
@@ -49,10 +53,6 @@ MAX_STEP = 0.1
 NO_MOTION = 0.001
 # A shorter path, two steps of the usual spacing, causes a notice.
 LITTLE_MOTION = 2 * FRAME_SPACING
-SIDE = 64  # pixels of a signature
-# Distance of two signatures below which they are one view. A picture resaved, noisy or moved a
-# little lies at .01 to .04 from itself; the closest two of 317 photos and frames at .08.
-SAME_VIEW = 0.05
 NAMED = 8  # photos that a message lists; all are in the record of the selection
 
 
@@ -64,6 +64,7 @@ class Reason(StrEnum):
     CLIPPED = "clipped"
     BLURRED = "blurred"
     DUPLICATE = "duplicate"
+    EXPOSURE = "exposure"
     CLOSE = "close"
 
 
@@ -73,6 +74,7 @@ MEANINGS = {
     Reason.CLIPPED: "mostly black, blown out or flat",
     Reason.BLURRED: "less sharp than those around it",
     Reason.DUPLICATE: "same view as a kept one",
+    Reason.EXPOSURE: "same view as a kept one, in another exposure",
     Reason.CLOSE: "too close to a kept one"}
 
 
@@ -292,45 +294,20 @@ def video_candidates(
     return tuple(candidates)
 
 
-@dataclass(frozen=True, eq=False)
-class PhotoMeasures:
-    """The measures of one stored photo, by the functions of these names."""
-
-    signature: NDArray[np.float32]
-    exposure: tuple[float, float, float]
-    sharpness: float
-
-
-def measure_photo(rgb: NDArray[np.uint8]) -> PhotoMeasures:
-    """Returns the measures of a photo, [H, W, 3], that the selection needs."""
-    gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-    return PhotoMeasures(signature(gray), measure_exposure(gray), measure_sharpness(gray))
-
-
-def signature(gray: NDArray[np.uint8]) -> NDArray[np.float32]:  # [SIDE * SIDE]
-    """Returns a picture [H, W] reduced by area, without its mean and of length 1; zero if flat."""
-    small = cv2.resize(gray, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
-    small -= small.mean()
-    length = float(np.linalg.norm(small))
-    return np.asarray(small / length if length else small, np.float32)
-
-
 def choose_photos(
     folder: str, sources: Sequence[str], names: Sequence[str],
     measures: Sequence[PhotoMeasures | None],
 ) -> tuple[FrameCandidate, ...]:
     """Returns which photos of a folder are kept, and why the others are not.
 
-    Left out are those that cannot be read (their measures are None), show nothing, or show what a
-    sharper one shows. InputError if fewer than `MIN_FRAMES` different views remain.
+    Left out are those that cannot be read (their measures are None), show nothing, or show what
+    another shows. InputError if fewer than `MIN_FRAMES` different views remain.
     """
     readable = {index: photo for index, photo in enumerate(measures) if photo is not None}
     exposures = np.array([photo.exposure for photo in readable.values()], np.float64).reshape(-1, 3)
     check_exposure(folder, exposures, least=min(MIN_FRAMES, max(1, len(readable))), unit="photos")
     usable = [index for index, fine in zip(readable, has_content(exposures), strict=True) if fine]
-    redundant = find_duplicates(
-        np.stack([readable[index].signature for index in usable]),
-        np.array([readable[index].sharpness for index in usable], np.float64))
+    redundant = find_repeats([readable[index] for index in usable])
     like = {usable[place]: usable[original] for place, original in redundant.items()}
     views = len(usable) - len(like)
     if like and views < MIN_FRAMES:
@@ -343,7 +320,8 @@ def choose_photos(
     for index, photo in enumerate(measures):
         reason = (
             Reason.DAMAGED if photo is None else Reason.CLIPPED if index not in usable
-            else Reason.DUPLICATE if index in like else Reason.KEPT)
+            else _repeat_reason(photo, readable[like[index]]) if index in like
+            else Reason.KEPT)
         candidates.append(FrameCandidate(
             sources[index], index, reason, None if photo is None else round(photo.sharpness, 2),
             names[index] if reason is Reason.KEPT else None, like.get(index)))
@@ -358,7 +336,7 @@ def choose_beside(
 
     They are kept, except those that cannot be read, show nothing, or show what a kept one shows.
     """
-    kept = {place: photo.signature for place, photo in chosen.items() if photo is not None}
+    kept = {place: photo for place, photo in chosen.items() if photo is not None}
     candidates = {}
     for place, photo in beside.items():
         reason, like = Reason.KEPT, None
@@ -367,36 +345,19 @@ def choose_beside(
         elif not has_content(np.array([photo.exposure]))[0]:
             reason = Reason.CLIPPED
         else:
-            distances = {other: float(np.linalg.norm(photo.signature - signature))
-                         for other, signature in kept.items()}
-            like = next((other for other, distance in distances.items()
-                         if distance < SAME_VIEW), None)
-            reason = Reason.KEPT if like is None else Reason.DUPLICATE
+            like = next((other for other, known in kept.items()
+                         if is_same_view(photo, known)), None)
+            reason = Reason.KEPT if like is None else _repeat_reason(photo, kept[like])
         if photo is not None and reason is Reason.KEPT:
-            kept[place] = photo.signature
+            kept[place] = photo
         candidates[place] = FrameCandidate(
             sources[place], place, reason, None if photo is None else round(photo.sharpness, 2),
             names[place] if reason is Reason.KEPT else None, like)
     return candidates
 
 
-def find_duplicates(
-    signatures: NDArray[np.float32],  # [F, SIDE * SIDE]
-    sharpness: NDArray[np.float64],  # [F]
-) -> dict[int, int]:
-    """Returns for each redundant photo the one that replaces it, by index.
-
-    The sharpest of a group within `SAME_VIEW` remains. A flat picture is like no other.
-    """
-    unique: list[int] = []
-    redundant: dict[int, int] = {}
-    for index in np.argsort(-sharpness, kind="stable").tolist():
-        distances = np.linalg.norm(signatures[unique] - signatures[index], axis=1)
-        if len(unique) and distances.min() < SAME_VIEW and signatures[index].any():
-            redundant[index] = unique[int(np.argmin(distances))]
-        else:
-            unique.append(index)
-    return dict(sorted(redundant.items()))
+def _repeat_reason(photo: PhotoMeasures, kept: PhotoMeasures) -> Reason:
+    return Reason.EXPOSURE if compare_brightness(photo, kept) else Reason.DUPLICATE
 
 
 def describe_dropped(
@@ -405,11 +366,14 @@ def describe_dropped(
     """Returns notices about photos, of all or `among` some, that could be read but are left out."""
     dropped = candidates if among is None else among
     source_of = {candidate.index: candidate.source for candidate in candidates}
-    alike = [
-        f"{photo.source} (like {source_of[photo.like]})" for photo in dropped
-        if photo.reason is Reason.DUPLICATE and photo.like is not None]
-    empty = [photo.source for photo in dropped if photo.reason is Reason.CLIPPED]
+    reasons = {
+        Reason.DUPLICATE: "others show the same",
+        Reason.EXPOSURE: "others show the same in another exposure, of a bracket the middle one",
+        Reason.CLIPPED: "they are black, blown out or flat"}
+    names = {reason: [
+        photo.source if photo.like is None else f"{photo.source} (like {source_of[photo.like]})"
+        for photo in dropped if photo.reason is reason] for reason in reasons}
     return [
-        f"{len(names)} photos are left out because {reason}: {list_names(names, NAMED)}."
-        for names, reason in ((alike, "others show the same"),
-                              (empty, "they are black, blown out or flat")) if names]
+        f"{len(names[reason])} photos are left out because {text}: "
+        f"{list_names(names[reason], NAMED)}." for reason, text in reasons.items()
+        if names[reason]]

@@ -40,6 +40,7 @@ from recon_cli.capture.photos import (
     make_frame_names,
 )
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
+from recon_cli.capture.same_view import PhotoMeasures, measure_photo
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import FormatError, InputError, ManifestError, list_names
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
@@ -373,9 +374,9 @@ def _drop_raw_twins(photos: Sequence[Photo], plan: RawPlan, ctx: IngestContext) 
 def _write_photos(
     source: _PhotoSource, indices: Sequence[int], out: Path, config: IngestConfig,
     ctx: IngestContext,
-) -> tuple[list[frame_selection.PhotoMeasures | None], dict[str, str]]:
+) -> tuple[list[PhotoMeasures | None], dict[str, str]]:
     """Writes some photos; returns their measures, and why some cannot be read, by file name."""
-    measures: list[frame_selection.PhotoMeasures | None] = []
+    measures: list[PhotoMeasures | None] = []
     unreadable: dict[str, str] = {}
     with ctx.progress.bar("photos", len(indices), unit="photo") as bar:
         for index in indices:
@@ -384,7 +385,7 @@ def _write_photos(
             try:
                 rgb = _write_photo(photo, mask, source, out, name,
                                    source.longest_side(config.max_size))
-                measures.append(frame_selection.measure_photo(rgb))
+                measures.append(measure_photo(rgb))
             except InputError as error:
                 unreadable[photo.name] = f"{error.message} {error.hint}".rstrip()
                 measures.append(None)

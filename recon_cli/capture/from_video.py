@@ -269,7 +269,8 @@ def _write(
                 bar.advance()
                 ctx.record(done, len(names))
 
-        for index, rgb in frames_at(source.path, missing | sheet.wanted, threads=threads):
+        for index, rgb in frames_at(
+                source.path, missing | sheet.wanted, threads=threads, size=source.scan.size):
             sheet.add(index, rgb)
             if index in missing:
                 writing.append(pool.submit(_store, folder / names[index], rgb, max_size))

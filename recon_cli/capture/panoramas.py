@@ -1,26 +1,31 @@
 """360-degree panoramas among photos: told by their metadata, or by their content.
 
 A panorama is not taken by a pinhole camera: treated as such it gives wrong cameras or none. A
-folder is used as panoramas or as ordinary photos, whichever it holds more of.
+folder is used as panoramas or as ordinary photos, whichever it holds more of. Pictures that hold
+two are neither: unstitched ones of two fisheye lenses, and the views of both eyes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from recon_cli.capture.decoded_picture import Packing
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import BROKEN, Photo, open_image
+from recon_cli.capture.two_views import find_two_views, has_two_circles
 from recon_cli.capture.xmp import PanoramaArea
 from recon_cli.errors import InputError, list_names
+from recon_cli.io.views import evenly_spread
 
 _SMALL = (256, 128)
+_DETAILED = (1280, 640)  # at which circles are round in pictures of 2:1, and features are found
 _CHECKED = 8  # panoramas of a set, evenly spread
 # In panoramas the edge columns are neighbours: they differ as neighbours do, while columns half a
 # turn apart differ by 4 to 40 times as much. The top or the bottom row is one point. 14 of 19 and
@@ -49,6 +54,53 @@ def choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Proj
     """
     if camera == "perspective":
         return Projection(tuple(photos), panoramas=False)
+    single, notices = _drop_double(folder, photos)
+    chosen = _choose_projection(folder, single, camera)
+    return replace(chosen, notices=(*notices, *chosen.notices))
+
+
+def _drop_double(folder: str, photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
+    """Returns the photos without pictures that hold two, and notices; InputError where few remain.
+    """
+    doubled = {
+        "unstitched pictures of two fisheye lenses": (
+            _find_double(photos, lambda shape: abs(shape / 2 - 1) <= _ASPECT, has_two_circles),
+            "Export them as 360-degree (equirectangular) pictures with the app of the camera."),
+        "3D pictures with the views of both eyes side by side": (
+            _find_double(photos, lambda shape: shape > 2 * (1 + _ASPECT),
+                         lambda shown: find_two_views(shown) is Packing.SIDE_BY_SIDE),
+            "Cut one view out, for example with mkdir left && magick mogrify -path left -crop "
+            "50%x100%+0+0 +repage *.jpg")}
+    left, notices = list(photos), []
+    for kind, (found, advice) in doubled.items():
+        left = [photo for photo in left if photo not in found]
+        if found and len(left) < MIN_FRAMES:
+            raise InputError(
+                f"{len(found)} of the {len(photos)} pictures in {folder} are {kind}, such as "
+                f"{found[0].name}.",
+                hint=f"{advice} --camera perspective uses them as ordinary photos.")
+        if found:
+            names = list_names([photo.name for photo in found], _NAMED)
+            notices.append(f"{len(found)} {kind} are left out: {names}. {advice}")
+    return left, notices
+
+
+def _find_double(
+    photos: Sequence[Photo], fits: Callable[[float], bool],
+    test: Callable[[Sequence[NDArray[np.uint8]]], bool],
+) -> list[Photo]:
+    """Returns the photos of each size, of a shape that fits, of which some pass a test together."""
+    sizes: dict[tuple[int, int], list[Photo]] = {}
+    for photo in photos:
+        if not photo.is_raw and fits(photo.width / photo.height):
+            sizes.setdefault((photo.width, photo.height), []).append(photo)
+    return [photo for alike in sizes.values()
+            if test([picture for one in evenly_spread(alike, _CHECKED)
+                     if (picture := _read_small(one, _DETAILED)) is not None])
+            for photo in alike]
+
+
+def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Projection:
     if camera == "equirectangular":
         odd = [photo for photo in photos if photo.area is None
                and abs(photo.width / photo.height / 2 - 1) > _ASPECT]
@@ -156,10 +208,11 @@ def has_no_seam(rgb: NDArray[np.uint8]) -> bool:
     return bool(seam <= _SEAM * np.median(steps) and _OPPOSITE * seam < opposite)
 
 
-def _read_small(photo: Photo) -> NDArray[np.uint8] | None:
+def _read_small(
+    photo: Photo, size: tuple[int, int] = (2 * _SMALL[0], 2 * _SMALL[1])
+) -> NDArray[np.uint8] | None:
     """Returns a photo at a fraction of its size; None where it cannot be read."""
     with suppress(*BROKEN), open_image(photo.path) as image:
-        image.draft("RGB", (2 * _SMALL[0], 2 * _SMALL[1]))
-        return np.asarray(image.convert("RGB").resize(
-            (2 * _SMALL[0], 2 * _SMALL[1]), Image.Resampling.BOX))
+        image.draft("RGB", size)
+        return np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX))
     return None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,6 +47,8 @@ class Scan:
     # [h, w] at a reduced size, where something is fixed to the camera; None if nowhere
     overlay: NDArray[np.bool_] | None
     notices: tuple[str, ...]  # about conversions that the owner of the video may not expect
+    # of most frames, as stored: the others are scaled to it; None for that of the first
+    size: tuple[int, int] | None = None
 
     @property
     def expected(self) -> int:
@@ -87,6 +90,7 @@ class Scan:
             "motion": np.array(value["motion"], np.float64),  # null becomes NaN
             "exposure": np.array(value["exposure"], np.float64).reshape(-1, 3),
             "seconds": tuple(value["seconds"]),
+            "size": tuple(value["size"]) if value.get("size") else None,
             "intact": intact, "notices": tuple(value["notices"])})
 
 
@@ -103,6 +107,7 @@ class _FrameMeasures:
     bidirectional: bool
     corrupt: bool
     interlaced: bool
+    size: tuple[int, int]  # as stored
 
 
 def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
@@ -113,7 +118,7 @@ def scan_video(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
     """
     scan = _scan_once(path, threads=threads, step=step)
     if scan.lost and threads > 1:
-        scan = _scan_once(path, threads=1, step=step)
+        scan = _scan_once(path, threads=1, step=step, size=scan.size)
     return scan
 
 
@@ -126,7 +131,8 @@ def measure_scene(
     """
     meter = MotionMeter(scan.overlay)
     sharpness, motion = [], []
-    for item in video.decode(path, threads=decode_threads(scan, threads)):
+    for item in video.decode(
+            path, threads=decode_threads(scan, threads), size=scan.size):
         if not isinstance(item, Gap):
             gray = item.gray()
             sharpness.append(measure_sharpness(gray, scan.overlay))
@@ -143,15 +149,22 @@ def decode_threads(scan: Scan, threads: int) -> int:
     return 1 if scan.lost else threads
 
 
-def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
+def _scan_once(
+    path: Path, *, threads: int, step: Callable[[], None], size: tuple[int, int] | None = None
+) -> Scan:
+    """Returns a scan of frames that are scaled to `size`, by default that of most of them."""
     measures: list[_FrameMeasures] = []
     gaps: list[tuple[int, int | None]] = []  # (frames before it, pts)
+    misfits: list[tuple[int, int]] = []  # sizes of frames of another shape
     first: DecodedPicture | None = None
     meter, tracker, overlay, border = MotionMeter(), Tracker(), OverlayMeter(), BorderMeter()
     with ThreadPoolExecutor(1) as beside:  # the two halves take about as long
-        for item in video.decode(path, threads=threads):
+        for item in video.decode(path, threads=threads, size=size):
             if isinstance(item, Gap):
-                gaps.append((len(measures), item.pts))
+                if item.other_size is None:
+                    gaps.append((len(measures), item.pts))
+                else:
+                    misfits.append(item.other_size)
                 continue
             first = first or item
             gray = item.gray()
@@ -163,18 +176,38 @@ def _scan_once(path: Path, *, threads: int, step: Callable[[], None]) -> Scan:
             step()
     if first is None:
         raise _nothing_decoded(path)
+    sizes = Counter([*(frame.size for frame in measures), *misfits])
+    most = sizes.most_common(1)[0][0]
+    if size is None and most != first.tags.size:
+        return _scan_once(path, threads=threads, step=step, size=most)
     width, height = first.size
     claim = video.read_declared_length(path)
+    declared = claim.count(_frame_rate(measures) or claim.rate)
     return Scan(
-        width=width, height=height, gaps=len(gaps),
-        declared=claim.count(_frame_rate(measures) or claim.rate),
+        width=width, height=height, gaps=len(gaps), size=most,
+        declared=max(0, declared - len(misfits)),
         sharpness=np.array([frame.sharpness for frame in measures], np.float64),
         motion=np.array([frame.motion for frame in measures], np.float64),
         exposure=np.round(
             border.without_border(np.array([frame.exposure for frame in measures])), 4),
         seconds=tuple(frame.seconds for frame in measures),
         intact=_find_intact(measures, gaps), tracks=tracker.tracks(), overlay=overlay.overlay(),
-        notices=describe_conversions(path, first, sum(frame.interlaced for frame in measures)))
+        notices=(
+            *_describe_sizes(path, most, sizes, Counter(misfits)),
+            *describe_conversions(path, first, sum(frame.interlaced for frame in measures))))
+
+
+def _describe_sizes(
+    path: Path, most: tuple[int, int], sizes: Mapping[tuple[int, int], int],
+    misfits: Mapping[tuple[int, int], int],
+) -> list[str]:
+    """Returns a notice for each size of frames but the most common one."""
+    return [
+        f"{path.name} changes its picture size: {count} frames of {width}x{height} are "
+        + (f"left out, because {most[0]}x{most[1]} is more common and has another shape; to use "
+           "them, give that part as a video of its own." if (width, height) in misfits else
+           f"scaled to {most[0]}x{most[1]}.")
+        for (width, height), count in sizes.items() if (width, height) != most]
 
 
 def _nothing_decoded(path: Path) -> InputError:
@@ -199,15 +232,17 @@ def _measure(
         sharpness=measure_sharpness(gray), motion=meter.advance(gray),
         exposure=measure_exposure(gray), seconds=frame.time, pts=frame.pts,
         key=bool(frame.key_frame), bidirectional=frame.pict_type == PictureType.B,
-        corrupt=bool(frame.is_corrupt), interlaced=picture.interlaced)
+        corrupt=bool(frame.is_corrupt), interlaced=picture.interlaced,
+        size=(frame.width, frame.height))
 
 
 def _frame_rate(measures: Sequence[_FrameMeasures]) -> float:
     """Returns the mean frames per second, 0 where times are unknown."""
-    first, last = measures[0].seconds, measures[-1].seconds
-    if first is None or last is None or last <= first:
+    # Not of the first and the last: where clips were joined, a decoder may give some in disorder.
+    times = [frame.seconds for frame in measures if frame.seconds is not None]
+    if len(times) < len(measures) or max(times) <= min(times):
         return 0.0
-    return (len(measures) - 1) / (last - first)
+    return (len(measures) - 1) / (max(times) - min(times))
 
 
 def _find_intact(
@@ -252,9 +287,20 @@ def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> 
         videos = len(video.moving_pictures(container))
     if videos > 1:
         notices.append(f"{path.name} holds {videos} videos: the first that can be decoded is used.")
+    if first.tags.packing is not None:
+        width, height = first.size
+        notices.append(
+            f"{path.name} is 3D video ({first.tags.packing.words}): the view of the left eye is "
+            f"used, {width}x{height} pixels.")
     if first.tags.transfer is not None:
         notices.append(
             f"{path.name} is {first.tags.transfer.value} video: tone-mapped to SDR by one curve.")
+    elif first.may_be_log:
+        notices.append(
+            f"{path.name} does not say how its brightness is stored, as log video (such as Apple "
+            "Log) does, and is read as SDR. If it looks flat, convert it first by the LUT of the "
+            f'camera\'s maker: ffmpeg -i "{path}" -vf lut3d=LUT.cube -crf 16 '
+            f'"{path.stem}-709.mp4"')
     elif first.tags.primaries in WIDE_GAMUTS:
         notices.append(
             f"{path.name} has colours of {WIDE_GAMUTS[first.tags.primaries]}: converted to sRGB.")
@@ -265,8 +311,9 @@ def describe_conversions(path: Path, first: DecodedPicture, interlaced: int) -> 
     if interlaced:
         notices.append(f"{path.name} is interlaced: {interlaced} frames are deinterlaced.")
     width, height = first.square_size
-    if (width, height) != (first.frame.width, first.frame.height):
+    stored = first.tags.size or (first.frame.width, first.frame.height)
+    if (width, height) != stored and first.tags.packing is None:
         notices.append(
             f"{path.name} has pixels of aspect {first.tags.aspect}: its frames of "
-            f"{first.frame.width}x{first.frame.height} are stretched to {width}x{height}.")
+            f"{stored[0]}x{stored[1]} are stretched to {width}x{height}.")
     return tuple(notices)

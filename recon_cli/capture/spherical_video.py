@@ -1,24 +1,24 @@
-"""360-degree videos: stitched ones by their metadata or content, and those still to be stitched.
+"""Videos that are no pictures of one ordinary lens: 360-degree, unstitched, both eyes of 3D.
 
-Metadata are the boxes of Google's Spherical Video V2 (st3d, sv3d) and the XML of V1, in the index
-of an MP4 or MOV.
+They are told by their metadata (Google's Spherical Video V1 and V2 in MP4 and MOV, the projection
+and the stereo mode in Matroska, which FFmpeg all gives with each frame), else by what they show.
 """
 
 from __future__ import annotations
 
-import mmap
-import re
 import struct
 from pathlib import Path
 
 from recon_cli.capture import video
+from recon_cli.capture.decoded_picture import DecodedPicture, Packing, read_side_data
 from recon_cli.capture.panoramas import wraps_around
+from recon_cli.capture.two_views import find_two_views, has_two_circles
 from recon_cli.errors import InputError
 
-_V2 = re.compile(rb"sv3d.{0,400}?proj.{0,200}?(equi|cbmp|mshp)", re.DOTALL)
-_V1 = re.compile(rb"GSpherical:ProjectionType>\s*([A-Za-z]+)")
-# after version and flags: 1 top and bottom, 2 left and right
-_STEREO = re.compile(rb"st3d.{4}[\x01\x02]|GSpherical:StereoMode>\s*(?:top|left)", re.DOTALL)
+# AVSphericalProjection (libavutil/spherical.h); the fifth, rectilinear, is an ordinary picture.
+_PROJECTIONS = {
+    0: "equirectangular", 1: "cubemap", 2: "equirectangular tile", 3: "half equirectangular",
+    5: "fisheye", 6: "parametric immersive"}
 # Frames that are looked at, and how many of them must wrap around.
 _LOOKED_AT, _EVERY, _LEAST = 5, 40, 3
 # What cameras with two fisheye lenses write, and who stitches that.
@@ -26,8 +26,12 @@ _STITCHERS = {
     ".insv": "Insta360 Studio", ".360": "GoPro Player", ".osv": "DJI Studio"}
 
 
-def refuse_unstitched(path: Path) -> None:
-    """Raises InputError for the recording of two fisheye lenses, which must be stitched first."""
+def refuse_unusable(path: Path, camera: str) -> None:
+    """Raises InputError for a video of which no frame is one picture; `camera` of IngestConfig.
+
+    That are two fisheye lenses, which must be stitched first, and the views of both eyes where no
+    tag tells them apart.
+    """
     stitcher = _STITCHERS.get(path.suffix.lower())
     sizes = []
     if path.suffix.lower() in (".mp4", ".mov", *_STITCHERS):
@@ -37,11 +41,28 @@ def refuse_unstitched(path: Path) -> None:
                      if stream.codec_context is not None]
     twins = len(sizes) == 2 and sizes[0] == sizes[1] and (
         stitcher is not None or sizes[0][0] == sizes[0][1])
-    if stitcher is None and not twins:
+    if stitcher is not None or twins:
+        raise _unstitched(path, stitcher, len(sizes))
+    if camera == "perspective":
         return
-    tracks = f"{len(sizes)} tracks of video" if len(sizes) > 1 else "one track of video"
-    raise InputError(
-        f"{path} is a recording of two fisheye lenses that is not stitched yet ({tracks}).",
+    shown = [picture.rgb() for picture in video.sample_frames(path, _LOOKED_AT)
+             if picture.tags.packing is None]
+    if has_two_circles(shown):
+        raise _unstitched(path, None, 1)
+    packing = find_two_views(shown)
+    if packing is not None:
+        crop = "iw/2:ih:0:0" if packing is Packing.SIDE_BY_SIDE else "iw:ih/2:0:0"
+        raise InputError(
+            f"Every frame of {path} shows the same view twice ({packing.words}), as 3D video does.",
+            hint=f'Cut one view out, for example with ffmpeg -i "{path}" -vf crop={crop} -crf 16 '
+            f'"{path.stem}-left.mp4"; --camera perspective uses the frames as they are.')
+
+
+def _unstitched(path: Path, stitcher: str | None, tracks: int) -> InputError:
+    """Returns the error for a recording of two fisheye lenses."""
+    held = f"{tracks} tracks of video" if tracks > 1 else "one track of video"
+    return InputError(
+        f"{path} is a recording of two fisheye lenses that is not stitched yet ({held}).",
         hint=f"Export it as a 360-degree (equirectangular) .mp4 with {stitcher or 'the app'}"
         f"{'' if stitcher else ' of the camera'}, with stabilisation on, and give that.")
 
@@ -49,17 +70,11 @@ def refuse_unstitched(path: Path) -> None:
 def is_spherical(path: Path, width: int, height: int, frames: int, camera: str) -> bool:
     """Returns whether a video is a stitched 360-degree one; `camera` is that of IngestConfig.
 
-    `width`, `height` and `frames` are those of the scan. InputError for one that cannot be used: in
-    another projection, or with a picture for each eye.
+    `width`, `height` and `frames` are those of the scan. InputError for one in another projection.
     """
     if camera == "perspective":
         return False
-    projection, stereo = read_projection(path)
-    if stereo and (projection or camera == "equirectangular"):
-        raise InputError(
-            f"{path} holds a panorama for each eye.",
-            hint="Cut one out: of top and bottom, for example with "
-            f'ffmpeg -i "{path}" -vf crop=iw:ih/2:0:0 -crf 16 "{path.stem}-left.mp4"')
+    projection = read_projection(path)
     if projection not in ("", "equirectangular"):
         raise InputError(
             f"{path} is a 360-degree video in the projection {projection}; needed is "
@@ -78,29 +93,9 @@ def is_spherical(path: Path, width: int, height: int, frames: int, camera: str) 
     return sum(around) >= min(_LEAST, len(around))
 
 
-def read_projection(path: Path) -> tuple[str, bool]:
-    """Returns the projection by a video's metadata, "" without any, and whether it is stereo."""
-    index = _read_index(path)
-    v2, v1 = _V2.search(index), _V1.search(index)
-    names = {b"equi": "equirectangular", b"cbmp": "cubemap", b"mshp": "mesh"}
-    projection = names[v2[1]] if v2 else v1[1].decode().lower() if v1 else ""
-    return projection, _STEREO.search(index) is not None
-
-
-def _read_index(path: Path) -> bytes:
-    """Returns the moov box of an MP4 or MOV; empty of other files."""
-    size = path.stat().st_size
-    if size < 16:
-        return b""
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        at = 0
-        while at + 16 <= size:
-            length, name = struct.unpack_from(">I4s", data, at)
-            if length == 1:
-                length = struct.unpack_from(">Q", data, at + 8)[0]
-            if name == b"moov":
-                return bytes(data[at:at + length if length else size])
-            if length < 8 or not name.isalpha():
-                break
-            at += length
-    return b""
+def read_projection(path: Path) -> str:
+    """Returns the projection of a 360-degree video by its metadata; "" without any."""
+    first = next((item for item in video.decode(path, threads=1)
+                  if isinstance(item, DecodedPicture)), None)
+    data = None if first is None else read_side_data(first.frame, "SPHERICAL")
+    return "" if data is None else _PROJECTIONS.get(struct.unpack_from("=i", data)[0], "")

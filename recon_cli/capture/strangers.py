@@ -65,16 +65,23 @@ def find_features(gray: NDArray[np.uint8]) -> _Features:
         np.asarray(descriptors, np.float32))
 
 
+def match_features(
+    first: _Features, second: _Features
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Returns the places [M, 2] of matching features in two pictures of two features or more."""
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    good = [best for best, next_best in pairs if best.distance < RATIO * next_best.distance]
+    good = list({match.trainIdx: match for match in good}.values())
+    return (first.xy[[match.queryIdx for match in good]],
+            second.xy[[match.trainIdx for match in good]])
+
+
 def count_agreeing(first: _Features, second: _Features) -> int:
     """Returns how many features of two pictures match under one epipolar geometry."""
     if min(len(first.xy), len(second.xy)) < AGREEING:
         return 0
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-    good = [best for best, next_best in pairs if best.distance < RATIO * next_best.distance]
-    good = list({match.trainIdx: match for match in good}.values())
-    if len(good) < AGREEING:
+    start, end = match_features(first, second)
+    if len(start) < AGREEING:
         return 0
-    _, inside = cv2.findFundamentalMat(
-        first.xy[[match.queryIdx for match in good]], second.xy[[match.trainIdx for match in good]],
-        cv2.FM_RANSAC, REACH, 0.999, 2000)
+    _, inside = cv2.findFundamentalMat(start, end, cv2.FM_RANSAC, REACH, 0.999, 2000)
     return 0 if inside is None else int(inside.sum())

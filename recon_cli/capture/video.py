@@ -11,7 +11,7 @@ import mmap
 import re
 import struct
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from recon_cli.capture.decoded_picture import (
     DecodedPicture,
     Gap,
     Orientation,
+    Packing,
     Tags,
     deinterlace,
     read_tags,
@@ -163,11 +164,14 @@ def _count_frames(container: InputContainer, stream: VideoStream) -> int:
     return stream.frames
 
 
-def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
+def decode(
+    path: Path, *, threads: int, size: tuple[int, int] | None = None
+) -> Iterator[DecodedPicture | Gap]:
     """Yields every frame of a video in presentation order, and a `Gap` for each lost packet.
 
-    The frames of an undamaged video do not depend on `threads`. A frame of another size than the
-    first counts as lost.
+    The frames of an undamaged video do not depend on `threads`. Frames of several sizes are scaled
+    to `size` (as stored, width and height), else to that of the first; those of another shape are
+    gaps.
     """
     with open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
@@ -178,8 +182,11 @@ def decode(path: Path, *, threads: int) -> Iterator[DecodedPicture | Gap]:
                 yield item
                 continue
             # Not before the first frame: some cameras signal HLG only within the stream.
-            tags = tags or _read_tags(path, stream, item[0])
-            yield DecodedPicture(item[0], tags, item[1])
+            frame = item[0]
+            tags = tags or replace(
+                _read_tags(path, stream, frame), size=size or (frame.width, frame.height))
+            picture = DecodedPicture(frame, tags, item[1])
+            yield picture if picture.fits else Gap(frame.pts, (frame.width, frame.height))
 
 
 def _read_tags(path: Path, stream: VideoStream, first: av.VideoFrame) -> Tags:
@@ -191,17 +198,41 @@ def _read_tags(path: Path, stream: VideoStream, first: av.VideoFrame) -> Tags:
             f"{path} stores its colours as {name}, which cannot be converted here.",
             hint="Convert it first, for example with "
             f'ffmpeg -i "{path}" -vf zscale=matrix={matrix} -crf 16 "{path.stem}-{matrix}.mp4"')
-    return read_tags(stream, first)
+    tags = read_tags(stream, first)
+    if tags.packing not in (None, Packing.SIDE_BY_SIDE, Packing.TOP_AND_BOTTOM):
+        raise InputError(
+            f"{path} is 3D video whose frames weave the views of both eyes together "
+            f"({tags.packing.words}).",
+            hint="Export the view of one eye with the program that it comes from.")
+    return tags
+
+
+def sample_frames(path: Path, count: int) -> list[DecodedPicture]:
+    """Returns up to `count` key frames, spread over the video as far as its index allows."""
+    pictures: list[DecodedPicture] = []
+    with open_video(path) as (container, stream):
+        stream.codec_context.skip_frame = "NONKEY"
+        for place in range(count):
+            with suppress(av.error.FFmpegError, StopIteration):
+                if container.duration:
+                    container.seek(round((place + 0.5) / count * container.duration))
+                frame = next(container.decode(stream))
+                pictures.append(DecodedPicture(frame, _read_tags(path, stream, frame)))
+    return pictures
 
 
 def frames_at(
-    path: Path, indices: Collection[int], *, threads: int
+    path: Path, indices: Collection[int], *, threads: int, size: tuple[int, int] | None = None
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yields (index, RGB [H, W, 3]) in ascending order; InputError if the file lacks an index."""
+    """Yields (index, RGB [H, W, 3]) in ascending order; InputError if the file lacks an index.
+
+    `size` is that of `decode`.
+    """
     missing = set(indices)
     if not missing:
         return
-    pictures = (item for item in decode(path, threads=threads) if isinstance(item, DecodedPicture))
+    pictures = (item for item in decode(path, threads=threads, size=size)
+                if isinstance(item, DecodedPicture))
     for index, picture in enumerate(pictures):
         if index in missing:
             yield index, picture.rgb()
@@ -257,15 +288,12 @@ def _presentation_times(path: Path) -> list[int]:
 
 
 def _decode_frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame | Gap]:
-    """Yields the frames of one size, and gaps; continues after errors of demuxer and decoder."""
-    size: tuple[int, int] | None = None
+    """Yields frames and gaps; continues after errors of demuxer and decoder."""
     for _ in range(MAX_DEMUX_ERRORS):
         try:
             for packet in container.demux(stream):
                 try:
-                    for frame in packet.decode():
-                        size = size or (frame.width, frame.height)
-                        yield frame if (frame.width, frame.height) == size else Gap(frame.pts)
+                    yield from packet.decode()
                 except av.error.FFmpegError:
                     yield Gap(packet.pts)
             return

@@ -52,19 +52,10 @@ def ingest(call: Call, inputs: tuple[Path, ...]) -> None:
 
 
 @verb("denoise")
-@click.option(
-    "--compare", is_flag=True,
-    help="Compare the filters on this capture: print gains and losses, write compare.json into the "
-         "workspace, and exit.  [default: off]")
 @options.stage(DenoiseConfig)
 @pass_call
-def denoise(call: Call, compare: bool) -> None:
+def denoise(call: Call) -> None:
     """Filter noisy frames and pass the others through."""
-    if compare:
-        from recon_cli.experiments.filter_comparison import compare_filters
-
-        click.echo(compare_filters(*open_job_with(call, DenoiseConfig)).text())
-        return
     run_stages(call, "denoise", ["denoise"])
 
 

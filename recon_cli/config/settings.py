@@ -42,6 +42,7 @@ SECTIONS: dict[str, type[StageConfig]] = {
 # Options that are gone, with the values that ask for what is done now: a file of an earlier
 # version, as `--print-config` wrote it, still means the same.
 GONE: dict[str, dict[str, tuple[Any, ...]]] = {
+    "denoise": {"filter": ("bilateral",)},
     "train": {"poses": ("auto", "off"), "densify_scale": (0.01,)},
     "merge": {"validation": (0.05,)},
 }

@@ -79,12 +79,9 @@ class DenoiseConfig(StageConfig):
     threshold: float = option(
         3.0, "Noise level of flat regions above which a frame is denoised.", unit="1/255",
         minimum=0.0)
-    filter: str = option(
-        "joint", "joint keeps edges best; bilateral takes a quarter of the time.",
-        choices=("joint", "bilateral"))
     strength: float = option(
-        4.0, "Range sigma of the filter, as a multiple of the noise (joint: of the noise that is "
-        "left in the guide).", unit="x noise", minimum=0.1)
+        4.0, "Range sigma of the bilateral filter, as a multiple of the noise.", unit="x noise",
+        minimum=0.1)
 
 
 @dataclass(frozen=True)

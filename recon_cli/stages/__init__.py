@@ -65,7 +65,7 @@ class Stage:
 STAGES: tuple[Stage, ...] = (
     Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 5, False,
           "recon_cli.stages.ingest", input_metavar="VIDEO"),
-    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 2, True,
+    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 3, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 3, True,
           "recon_cli.stages.sfm",

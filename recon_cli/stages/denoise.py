@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon_cli.capture.noise import FILTERS, estimate_noise
+from recon_cli.capture.noise import bilateral, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io.images import read_png, write_png
@@ -44,7 +44,7 @@ def run(config: DenoiseConfig, inputs: StageInputs, out: Path, ctx: StageContext
         outcome.name: {"sigma_255": outcome.sigma, "denoised": outcome.filtered}
         for outcome in outcomes})
     return DenoiseSummary(
-        mode=config.mode, filter=config.filter, frames=len(outcomes),
+        mode=config.mode, frames=len(outcomes),
         denoised=sum(outcome.filtered for outcome in outcomes),
         median_sigma_255=round(float(np.median([item.sigma for item in outcomes])), 4))
 
@@ -75,7 +75,7 @@ def _frame(config: DenoiseConfig, source: Path, target: Path) -> _Outcome:
         if filtered:
             # With --force the estimate is taken to be too low.
             noise = max(sigma, config.threshold)
-            write_png(target, FILTERS[config.filter](rgb, noise, config.strength))
+            write_png(target, bilateral(rgb, noise, config.strength))
         else:
             with atomic.replacing(target) as temporary:  # with a link, editing one changes both
                 shutil.copyfile(source, temporary)

@@ -13,7 +13,7 @@ from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import IngestedSource, merge_sources
 from recon_cli.capture.photo_tree import find_photo_files, find_videos
-from recon_cli.capture.spherical_video import refuse_unstitched
+from recon_cli.capture.spherical_video import refuse_unusable
 from recon_cli.config.stages import IngestConfig, parse_holdout
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.datasets import from_data_set
@@ -127,7 +127,7 @@ def _ingest(
               if not _is_photos(part[0])]
     for path, _ in videos:
         _tell_foreign(path, ctx)
-        refuse_unstitched(path)
+        refuse_unusable(path, config.camera)
     scans = [from_video.scan(config, path, out / f"{prefix}{from_video.SCAN}", ctx)
              for path, prefix in videos]
     numbers = from_video.frame_counts(config, scans)

@@ -42,7 +42,6 @@ class DenoiseSummary(JsonRecord):
     """Which frames denoise filtered."""
 
     mode: str
-    filter: str
     frames: int
     denoised: int
     median_sigma_255: float  # noise of the median frame in 1/255

@@ -1,15 +1,12 @@
-"""The estimate of noise and the filters that remove it."""
+"""The estimate of noise and the filter that removes it."""
 
 import cv2
 import numpy as np
 import pytest
 from noisy_room import noisy, plain_room, psnr
 
-from recon_cli.capture.noise import FILTERS, estimate_noise
-from recon_cli.config.fields import option_info
+from recon_cli.capture.noise import bilateral, estimate_noise
 from recon_cli.config.stages import DenoiseConfig
-from recon_cli.errors import ConfigError
-from recon_cli.experiments.filter_comparison import edges_kept
 
 pytestmark = pytest.mark.floors
 
@@ -45,69 +42,41 @@ def test_small_frames_can_be_measured():
 STRENGTH = DenoiseConfig().strength
 
 
-@pytest.fixture(params=list(FILTERS))
-def denoised(request):
-    return FILTERS[request.param]
-
-
-def test_every_filter_can_be_asked_for():
-    field = next(f for f in DenoiseConfig.__dataclass_fields__.values() if f.name == "filter")
-    assert set(option_info(field).choices) == set(FILTERS)
-    assert DenoiseConfig().filter in FILTERS
-
-
 @pytest.mark.parametrize(("sigma", "gain"), [(5, 3), (15, 6), (25, 7)])
-def test_denoising_brings_a_frame_closer_to_the_truth(denoised, sigma, gain):
+def test_denoising_brings_a_frame_closer_to_the_truth(sigma, gain):
     truth = plain_room()
     spoiled = noisy(truth, sigma)
-    better = denoised(spoiled, estimate_noise(spoiled), STRENGTH)
+    better = bilateral(spoiled, estimate_noise(spoiled), STRENGTH)
     assert psnr(better, truth) > psnr(spoiled, truth) + gain
 
 
-def test_an_edge_stays_where_and_as_high_as_it_was(denoised):
+def test_an_edge_stays_where_and_as_high_as_it_was():
     step = np.full((60, 80, 3), 60, np.uint8)
     step[:, 40:] = 190
-    columns = denoised(noisy(step, 10), 10, STRENGTH).astype(float).mean(axis=(0, 2))
+    columns = bilateral(noisy(step, 10), 10, STRENGTH).astype(float).mean(axis=(0, 2))
     # 130 high, noise of 10: the columns beside the edge keep their side within the noise's mean.
     np.testing.assert_allclose(columns[36:40], 60, atol=6)
     np.testing.assert_allclose(columns[40:44], 190, atol=6)
 
 
-def test_without_noise_nothing_is_filtered_away(denoised):
+def test_without_noise_nothing_is_filtered_away():
     room = plain_room()
-    assert cv2.absdiff(denoised(room, 0.3, STRENGTH), room).max() <= 2
+    assert cv2.absdiff(bilateral(room, 0.3, STRENGTH), room).max() <= 2
 
 
-def test_the_default_keeps_more_edges_and_comes_closer_than_the_bilateral_filter():
-    truth = plain_room()
-    spoiled = noisy(truth, 15)
-    ours = FILTERS[DenoiseConfig().filter](spoiled, 15, STRENGTH)
-    bilateral = FILTERS["bilateral"](spoiled, 15, STRENGTH)
-    assert psnr(ours, truth) > psnr(bilateral, truth)
-    assert edges_kept(truth, ours) > edges_kept(truth, bilateral)
-
-
-def test_the_number_of_threads_changes_no_pixel(denoised):
+def test_the_number_of_threads_changes_no_pixel():
     spoiled = noisy(plain_room(), 10)
     before = cv2.getNumThreads()
     try:
         results = []
         for threads in (1, 4):
             cv2.setNumThreads(threads)
-            results.append(denoised(spoiled, 10, STRENGTH))
+            results.append(bilateral(spoiled, 10, STRENGTH))
     finally:
         cv2.setNumThreads(before)
     np.testing.assert_array_equal(*results)
 
 
-def test_a_frame_of_a_few_pixels_can_be_filtered(denoised):
-    assert denoised(np.full((3, 2, 3), 90, np.uint8), 5, STRENGTH).tolist() == [
+def test_a_frame_of_a_few_pixels_can_be_filtered():
+    assert bilateral(np.full((3, 2, 3), 90, np.uint8), 5, STRENGTH).tolist() == [
         [[90] * 3] * 2] * 3
-
-
-def test_an_opencv_without_its_contributed_modules_is_named(monkeypatch):
-    monkeypatch.delattr(cv2, "ximgproc")
-    with pytest.raises(ConfigError, match="installed over opencv-contrib") as caught:
-        FILTERS["joint"](plain_room(), 8.0, 4.0)
-    assert "--filter bilateral" in caught.value.hint
-    assert FILTERS["bilateral"](plain_room(), 8.0, 4.0).shape == plain_room().shape

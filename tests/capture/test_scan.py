@@ -287,3 +287,76 @@ def test_a_second_video_in_the_file_is_named(tmp_path):
             container.mux([*stream.encode(frame), *stream.encode()])
     assert notices(path) == ("two.mkv holds 2 videos: the first that can be decoded is used.",)
     assert scan_video(path, threads=1, step=lambda: None).width == 96
+
+
+def joined(path, *parts):
+    """A transport stream of clips (count, width, height) joined without encoding them again."""
+    with av.open(str(path), "w") as target:
+        stream, end = None, 0
+        for number, (count, width, height) in enumerate(parts):
+            frames = [cv2.resize(moved, (width, height), interpolation=cv2.INTER_AREA)
+                      for moved in stroll(count, seed=number)]
+            clip = write_video(path.with_name(f"{number}.ts"), frames, muxer="mpegts",
+                               options={"qp": "4", "bf": "0"})
+            with av.open(str(clip)) as source:
+                stream = stream or target.add_stream_from_template(source.streams.video[0])
+                start = source.streams.video[0].start_time
+                for packet in source.demux(video=0):
+                    if packet.size:
+                        packet.pts = packet.dts = packet.pts - start + end
+                        packet.stream = stream
+                        target.mux(packet)
+            end += count * 9000  # ticks of 1/90000 s at 10 frames a second
+    return path
+
+
+def stroll(count, *, seed):
+    wall = texture(192, 256 + 4 * count, seed=seed, coarseness=8)
+    return [wall[:, 4 * step:4 * step + 256] for step in range(count)]
+
+
+@pytest.mark.parametrize(("parts", "size"), [
+    (((12, 128, 96), (6, 256, 192)), (128, 96)), (((6, 256, 192), (12, 128, 96)), (128, 96))])
+def test_frames_of_another_size_are_scaled_to_the_most_common_one(tmp_path, parts, size):
+    path = joined(tmp_path / "a.ts", *parts)
+    scan = scan_video(path, threads=2, step=lambda: None)
+    assert (scan.width, scan.height) == size == scan.size
+    assert len(scan.intact) == 18
+    assert scan.intact.all()
+    assert scan.lost == scan.gaps == 0
+    assert any("6 frames of 256x192 are scaled to 128x96" in one for one in scan.notices)
+    shown = dict(frames_at(path, range(18), threads=1, size=scan.size))
+    assert {rgb.shape for rgb in shown.values()} == {(96, 128, 3)}
+    alone = [cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+             for count, *_ in parts for rgb in stroll(count, seed=int(count != parts[0][0]))]
+    for index, rgb in shown.items():
+        assert index == np.argmax([cv2.PSNR(rgb, other) for other in alone])
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_frames_of_another_shape_are_left_out_and_named(tmp_path, first):
+    parts = [(6, 96, 128), (12, 128, 96)]
+    path = joined(tmp_path / "a.ts", *(parts if first else parts[::-1]))
+    scan = scan_video(path, threads=2, step=lambda: None)
+    assert (scan.width, scan.height) == (128, 96)
+    assert len(scan.intact) == 12
+    assert scan.intact.all()
+    assert scan.lost == 0
+    assert any("6 frames of 96x128 are left out" in one for one in scan.notices)
+
+
+def test_the_size_is_kept_with_a_scan(tmp_path):
+    scan = scan_video(joined(tmp_path / "a.ts", (3, 256, 192), (6, 128, 96)), threads=1,
+                      step=lambda: None)
+    scan.write(tmp_path / "scan.json")
+    assert Scan.read(tmp_path / "scan.json").size == (128, 96)
+
+
+@pytest.mark.parametrize(("primaries", "trc", "log"), [
+    (9, 2, True), (9, 1, False), (9, 14, False), (1, 2, False), (12, 2, False), (1, 9, True),
+    (9, 18, False)])
+def test_video_that_may_be_log_is_named(tmp_path, primaries, trc, log):
+    path = write_luma(
+        tmp_path / "a.mp4", [np.full((64, 96), 500)] * 3, trc=trc, primaries=primaries)
+    scan = scan_video(path, threads=1, step=lambda: None)
+    assert any("lut3d" in one for one in scan.notices) == log

@@ -5,9 +5,14 @@ import struct
 import av
 import numpy as np
 import pytest
+from media import texture
+from media import write_video as write_one
 from test_panoramas import sphere
+from test_two_views import both_eyes, two_circles, view
 
-from recon_cli.capture.spherical_video import is_spherical, read_projection, refuse_unstitched
+from recon_cli.capture.scan import scan_video
+from recon_cli.capture.spherical_video import is_spherical, read_projection, refuse_unusable
+from recon_cli.capture.video import decode
 from recon_cli.errors import InputError
 
 
@@ -34,15 +39,19 @@ def box(name, content):
 
 
 def with_metadata(path, *, stereo=0, projection=b"equi"):
-    """Appends the boxes of Spherical Video V2 to the index of a video, as a box of its own."""
+    """Appends the boxes of Spherical Video V2 to the sample entry of a video."""
     proj = box(b"prhd", bytes(16)) + box(projection, bytes(20))
-    boxes = box(b"st3d", bytes(4) + bytes([stereo])) + box(b"sv3d", box(
-        b"svhd", bytes(5)) + box(b"proj", proj))
-    data = path.read_bytes()
-    at = data.rindex(b"moov") - 4
-    size = struct.unpack_from(">I", data, at)[0]
-    index = data[at + 8:at + size] + box(b"udta", boxes)
-    path.write_bytes(data[:at] + box(b"moov", index) + data[at + size:])
+    boxes = box(b"st3d", bytes(4) + bytes([stereo])) + (box(b"sv3d", box(
+        b"svhd", bytes(5)) + box(b"proj", proj)) if projection else b"")
+    data = bytearray(path.read_bytes())
+    end = 0
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"):
+        at = data.index(name, data.rindex(b"moov")) - 4
+        size, = struct.unpack_from(">I", data, at)
+        struct.pack_into(">I", data, at, size + len(boxes))
+        end = at + size
+    data[end:end] = boxes
+    path.write_bytes(data)
     return path
 
 
@@ -54,10 +63,10 @@ def plain(tmp_path):
 
 
 def test_metadata_tell_the_projection(plain):
-    assert read_projection(plain) == ("", False)
+    assert read_projection(plain) == ""
     assert not is_spherical(plain, 128, 64, 5, "auto")
     with_metadata(plain)
-    assert read_projection(plain) == ("equirectangular", False)
+    assert read_projection(plain) == "equirectangular"
     assert is_spherical(plain, 128, 64, 5, "auto")
     assert not is_spherical(plain, 128, 64, 5, "perspective")
 
@@ -74,14 +83,141 @@ def test_what_was_asked_for_must_be_twice_as_wide_as_high(plain):
         is_spherical(plain, 128, 96, 5, "equirectangular")
 
 
-def test_a_panorama_for_each_eye_and_other_projections_are_refused(plain, tmp_path):
-    other = tmp_path / "other.mp4"
-    other.write_bytes(plain.read_bytes())
-    with pytest.raises(InputError, match="for each eye") as error:
-        is_spherical(with_metadata(plain, stereo=1), 128, 64, 5, "auto")
-    assert "crop=iw:ih/2" in error.value.hint
+def test_other_projections_are_refused(plain):
     with pytest.raises(InputError, match="projection cubemap"):
-        is_spherical(with_metadata(other, projection=b"cbmp"), 128, 64, 5, "auto")
+        is_spherical(with_metadata(plain, projection=b"cbmp"), 128, 64, 5, "auto")
+
+
+def test_of_a_panorama_for_each_eye_the_first_is_used(tmp_path):
+    path = write_video(tmp_path / "a.mp4", [np.concatenate([
+        np.full((64, 128, 3), 200, np.uint8), np.full((64, 128, 3), 50, np.uint8)])] * 5)
+    with_metadata(path, stereo=1)
+    picture = next(decode(path, threads=1))
+    assert picture.size == (128, 64)
+    assert abs(float(picture.rgb().mean()) - 200) < 4
+    assert is_spherical(path, 128, 64, 5, "auto")
+
+
+def write_matroska(path, pictures, **metadata):
+    """Writes a Matroska file whose track has these tags of FFmpeg's muxer."""
+    with av.open(str(path), "w", format="matroska") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": "8"}
+        stream.metadata.update(metadata)
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(
+                np.ascontiguousarray(picture), "rgb24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def element(name, content):
+    return name + (0x10000000 | len(content)).to_bytes(4, "big") + content
+
+
+def test_a_projection_in_matroska_counts(tmp_path):
+    path = write_matroska(
+        tmp_path / "a.mkv", [texture(64, 128, seed=seed) for seed in range(5)])
+    data = path.read_bytes()
+    # RFC 9559: Projection in Video, with ProjectionType 1, in place of the padding (Void) before.
+    projection = element(b"\x76\x70", b"\x76\x71\x81\x01")
+    path.write_bytes(into_track_video(data, projection))
+    assert read_projection(path) == "equirectangular"
+    assert is_spherical(path, 128, 64, 5, "auto")
+
+
+def into_track_video(data, content):
+    """Returns a Matroska file with an element more in the Video of its first track."""
+    spans, at, end = [], 0, len(data)
+    for name in (b"\x18\x53\x80\x67", b"\x16\x54\xae\x6b", b"\xae", b"\xe0"):
+        while not data[at:].startswith(name):
+            at += id_length(data[at]) + sum(read_size(data, at + id_length(data[at])))
+            assert at < end
+        digits, size = read_size(data, at + len(name))
+        spans.append((at + len(name), digits))
+        at += len(name) + digits
+    body = bytearray(data)
+    for where, digits in spans:
+        _, size = read_size(data, where)
+        if size != (1 << 7 * digits) - 1:  # not: of unknown size
+            body[where:where + digits] = (
+                (1 << 7 * digits) | size + len(content)).to_bytes(digits, "big")
+    body[at:at] = content
+    return bytes(body)
+
+
+def id_length(first):
+    return 9 - first.bit_length()
+
+
+def read_size(data, at):
+    """Returns how many bytes an element's size takes, and the size."""
+    digits = 9 - data[at].bit_length()
+    return digits, int.from_bytes(data[at:at + digits], "big") & (1 << 7 * digits) - 1
+
+
+def eyes(left, right, axis):
+    """Returns frames of two plain views, of the left eye first."""
+    return [np.concatenate([
+        np.full((96, 160, 3), value, np.uint8) for value in (left, right)], axis)] * 4
+
+
+@pytest.mark.parametrize(("packing", "axis"), [(3, 1), (4, 0)])
+def test_frame_packing_in_the_stream_gives_the_left_view(tmp_path, packing, axis):
+    path = write_one(tmp_path / "a.mp4", eyes(200, 50, axis), options={
+        "qp": "4", "x264-params": f"frame-packing={packing}"})
+    picture = next(decode(path, threads=1))
+    assert picture.size == (160, 96)
+    assert abs(float(picture.rgb().mean()) - 200) < 4
+    assert abs(float(picture.gray().mean()) - 200) < 4
+    scan = scan_video(path, threads=1, step=lambda: None)
+    assert (scan.width, scan.height) == (160, 96)
+    assert "left eye" in scan.notices[0]
+    refuse_unusable(path, "auto")
+
+
+@pytest.mark.parametrize(("mode", "axis", "first"), [
+    ("left_right", 1, True), ("right_left", 1, False), ("top_bottom", 0, True),
+    ("bottom_top", 0, False)])
+def test_the_stereo_mode_of_matroska_gives_the_left_view(tmp_path, mode, axis, first):
+    path = write_matroska(tmp_path / "a.mkv", eyes(200, 50, axis), stereo_mode=mode)
+    picture = next(decode(path, threads=1))
+    assert picture.size == (160, 96)
+    assert abs(float(picture.rgb().mean()) - (200 if first else 50)) < 4
+
+
+def test_views_that_were_squeezed_get_their_width_back(tmp_path):
+    squeezed = [frame[:, ::2] for frame in eyes(200, 50, 1)]
+    path = write_one(tmp_path / "a.mp4", squeezed, options={
+        "qp": "4", "x264-params": "frame-packing=3"})
+    assert next(decode(path, threads=1)).size == (160, 96)
+
+
+def test_views_that_are_woven_together_are_refused(tmp_path):
+    path = write_one(tmp_path / "a.mp4", eyes(200, 50, 1), options={
+        "qp": "4", "x264-params": "frame-packing=2"})
+    with pytest.raises(InputError, match="rows"):
+        next(decode(path, threads=1))
+
+
+def test_two_views_without_a_tag_are_refused_with_the_way_to_cut_one_out(tmp_path):
+    path = write_one(tmp_path / "a.mp4", [both_eyes(seed) for seed in range(6)])
+    with pytest.raises(InputError, match="same view twice") as error:
+        refuse_unusable(path, "auto")
+    assert "crop=iw/2:ih:0:0" in error.value.hint
+    refuse_unusable(path, "perspective")
+
+
+def test_two_circles_are_refused(tmp_path):
+    path = write_one(tmp_path / "a.mp4", [two_circles(seed) for seed in range(6)])
+    with pytest.raises(InputError, match="two fisheye lenses"):
+        refuse_unusable(path, "auto")
+
+
+def test_frames_of_one_view_are_not_refused(tmp_path):
+    refuse_unusable(
+        write_one(tmp_path / "a.mp4", [view(seed, width=640) for seed in range(6)]), "auto")
 
 
 @pytest.mark.parametrize(("name", "tracks", "app"), [
@@ -91,11 +227,12 @@ def test_two_fisheyes_are_refused_with_the_way_to_stitch_them(tmp_path, name, tr
     path = write_video(
         tmp_path / name, [np.full((64, 64, 3), 9 * k, np.uint8) for k in range(4)], tracks=tracks)
     with pytest.raises(InputError, match="two fisheye lenses") as error:
-        refuse_unstitched(path)
+        refuse_unusable(path, "auto")
     assert app in error.value.hint
 
 
 def test_an_ordinary_video_is_not_refused(plain, tmp_path):
-    refuse_unstitched(plain)
-    refuse_unstitched(write_video(  # such as a phone's of its two cameras
-        tmp_path / "both.mp4", [np.full((48, 64, 3), k, np.uint8) for k in range(4)], tracks=2))
+    refuse_unusable(plain, "auto")
+    both = write_video(  # such as a phone's of its two cameras
+        tmp_path / "both.mp4", [np.full((48, 64, 3), k, np.uint8) for k in range(4)], tracks=2)
+    refuse_unusable(both, "auto")

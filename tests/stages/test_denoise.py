@@ -119,14 +119,6 @@ def test_strength_sets_how_much_is_smoothed(ingest, tmp_path):
     assert change[0] < change[1]
 
 
-def test_the_filter_can_be_chosen(ingest, tmp_path):
-    results = {}
-    for name in ("joint", "bilateral"):
-        assert run(ingest, tmp_path / name, filter=name).filter == name
-        results[name] = read_png(tmp_path / name / "frames" / "000004.png")
-    assert psnr(results["joint"], room()) > psnr(results["bilateral"], room())
-
-
 def test_the_number_of_threads_changes_nothing(ingest, tmp_path):
     run(ingest, tmp_path / "one", threads=1)
     run(ingest, tmp_path / "four", threads=4)

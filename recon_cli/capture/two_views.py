@@ -1,0 +1,92 @@
+"""Pictures that hold two: of two fisheye lenses side by side, or one view for each eye.
+
+Both look like ordinary pictures to a reader of files; a scene made of them shows the room twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.capture.decoded_picture import Packing
+from recon_cli.capture.lens_border import LensCircle, fit_circle
+from recon_cli.capture.strangers import SIZE, find_features, match_features
+
+# Of a half's sides: by how much the middle of a fisheye's circle may miss that of its half.
+OFF_CENTRE = 0.1
+# Between the views of two eyes nothing moves up or down by more than this share of the height, and
+# to the side by no more than that of the width: a thing at arm's length, eyes 65 mm apart.
+RAISED, PARALLAX = 0.02, 0.2
+# Of the features of a view, those that its twin shows in the same place; and at least so many.
+SAME, LEAST = 0.2, 15
+
+
+def has_two_circles(pictures: Sequence[NDArray[np.uint8]]) -> bool:
+    """Returns whether pictures [H, W, 3] of one size show the circles of two fisheye lenses."""
+    if not pictures or len({picture.shape for picture in pictures}) > 1:
+        return False
+    small = [_reduce(picture).max(axis=2) for picture in pictures]
+    brightest = np.asarray(np.max(small, axis=0), np.uint8)
+    axis = int(brightest.shape[1] > brightest.shape[0])
+    return all(_is_centred(fit_circle(half), half.shape) for half in _halves(brightest, axis))
+
+
+def _is_centred(circle: LensCircle | None, shape: tuple[int, ...]) -> bool:
+    """Returns whether a circle is that of a whole fisheye in a picture [h, w]."""
+    if circle is None:
+        return False
+    height, width = shape[0], shape[1]
+    side = max(width, height)
+    return (abs(circle.x * side - width / 2) <= OFF_CENTRE * width
+            and abs(circle.y * side - height / 2) <= OFF_CENTRE * height)
+
+
+def find_two_views(pictures: Sequence[NDArray[np.uint8]]) -> Packing | None:
+    """Returns how all of some pictures [H, W, 3] show one view twice; None where one does not.
+
+    Of pictures with too little to match nothing is known; None where that are all.
+    """
+    for packing, axis in ((Packing.SIDE_BY_SIDE, 1), (Packing.TOP_AND_BOTTOM, 0)):
+        shown = False
+        for picture in pictures:
+            answer = _shows_twice(_reduce(picture), axis)
+            if answer is False:
+                break
+            shown = shown or answer is True
+        else:
+            if shown:
+                return packing
+    return None
+
+
+def _shows_twice(rgb: NDArray[np.uint8], axis: int) -> bool | None:
+    """Returns whether the halves of a picture are two eyes' views; None if they show nothing."""
+    first, second = (find_features(half) for half in _halves(
+        np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), axis))
+    fewer = min(len(first.xy), len(second.xy))
+    if fewer < LEAST:
+        return None if fewer == len(first.xy) == len(second.xy) == 0 else False
+    height, width = rgb.shape[0], rgb.shape[1]
+    sides = np.array([width / 2, height] if axis else [width, height / 2])
+    start, end = match_features(first, second)
+    apart = np.abs(end - start) / sides
+    same = int((apart <= [PARALLAX, RAISED]).all(axis=1).sum())
+    return same >= max(LEAST, SAME * fewer)
+
+
+def _halves(pixels: NDArray[np.uint8], axis: int) -> list[NDArray[np.uint8]]:
+    """Returns the top and the bottom (axis 0), or the left and the right half of a picture."""
+    middle = pixels.shape[axis] // 2
+    return np.split(pixels, [middle, 2 * middle], axis=axis)[:2]
+
+
+def _reduce(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Returns a picture whose halves are about as long as features need."""
+    scale = 2 * SIZE / max(rgb.shape[:2])
+    if scale >= 1:
+        return rgb
+    return np.asarray(cv2.resize(
+        rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
