@@ -68,7 +68,8 @@ class Warp:
     def apply(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Returns a picture [H, W, 3], as it lies on the sensor, without distortion."""
         parts = [rgb] if len(self.terms) == 1 else cv2.split(rgb)
-        moved = [cv2.remap(part, *self.sources(*rgb.shape[:2], plane), cv2.INTER_CUBIC,
+        height, width = rgb.shape[:2]
+        moved = [cv2.remap(part, *self.sources(height, width, plane), cv2.INTER_CUBIC,
                            borderMode=cv2.BORDER_REPLICATE)
                  for plane, part in enumerate(parts)]
         return np.asarray(moved[0] if len(moved) == 1 else cv2.merge(moved), np.uint8)
@@ -235,4 +236,4 @@ def _weights(
     """Returns the weights [N, knots] of a grid's knots for linear interpolation within it."""
     place = np.clip((at - origin) / (spacing or 1), 0, knots - 1)
     distance = np.abs(place[:, None] - np.arange(knots))
-    return np.maximum(1 - distance, 0).astype(np.float32)
+    return np.asarray(np.maximum(1 - distance, 0), np.float32)

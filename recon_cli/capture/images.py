@@ -380,11 +380,14 @@ def _decode(path: Path, *, upright: bool, white: int = WHITE) -> Image.Image:
             image.verify()  # checksums, which loading ignores; consumes the image
         with open_image(path) as image:
             coding = read_coding(path, image)
+            stored = getattr(image, "tag_v2", {}).get(ExifTags.Base.Orientation, 1)
             # first: reading the EXIF of a PNG consumes its tiles
             eight = (to_srgb(_eight_bits(path, image, white)) if coding is None
                      else convert_coding(*_read_signal(path, image), coding))
             turn = TURNS.get(_orientation(image))
-            return eight.transpose(turn) if upright and turn is not None else eight
+            if not upright:  # what Pillow loads of a TIFF it has turned; 6 and 8 undo each other
+                turn = TURNS.get({6: 8, 8: 6}.get(stored, stored)) if turn is None else None
+            return eight if turn is None else eight.transpose(turn)
     except BROKEN as error:
         raise unreadable_error(path, error) from error
 
@@ -419,7 +422,7 @@ def _jpeg2000_white(path: Path) -> int:
         return 255
     count, = struct.unpack_from(">H", data, start + COMPONENTS)
     depths = data[start + DEPTHS:start + DEPTHS + 3 * count:3]
-    return 2 ** (max(depths, default=7) % 128 + 1) - 1
+    return (1 << max(depths, default=7) % 128 + 1) - 1
 
 
 def _read_wide(path: Path, image: Image.Image) -> NDArray[Any]:

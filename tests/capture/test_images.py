@@ -375,7 +375,7 @@ def test_jpeg_xl_is_read_and_turned_once(tmp_path, mode, orientation):
     exif = Image.Exif()
     exif[ORIENTATION] = orientation
     image = Image.fromarray(picture()).convert(mode)
-    image.save(tmp_path / "a.jxl", lossless=True, exif=exif)
+    image.save(tmp_path / "a.jxl", lossless=True, exif=exif.tobytes())
     found = inspect_photo(tmp_path / "a.jxl")
     np.testing.assert_array_equal(read_photo(found), np.asarray(image.convert("RGB")))
 

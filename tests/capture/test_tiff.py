@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from recon_cli.capture.images import find_white, inspect_photo, read_alpha, read_photo
+from recon_cli.capture.images import (
+    find_white,
+    inspect_photo,
+    read_alpha,
+    read_as_stored,
+    read_photo,
+)
 from recon_cli.errors import InputError
 
 H, W = 20, 30
@@ -128,6 +134,14 @@ def test_either_byte_order_and_large_files_are_read(tmp_path, name, order, big):
         extrasamples=LAYOUTS[name][2] or None)
     found = read_photo(inspect_photo(tmp_path / "a.tif"))
     assert np.abs(found - 255 * shown(name, values)).max() <= MULTIPLIED
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(("name", "bits"), [("gray", 8), ("rgb", 8), ("rgb", 16)])
+def test_images_of_data_sets_stay_as_stored(tmp_path, name, bits, orientation):
+    samples, values = make_samples(name, bits)
+    path = write(tmp_path / "a.tif", name, samples, orientation=orientation)
+    assert np.abs(read_as_stored(path)[0] - 255 * values).max() <= ROUNDED
 
 
 def test_opacity_does_not_hide_that_values_have_12_bits(tmp_path):
