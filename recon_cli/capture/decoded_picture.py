@@ -25,7 +25,14 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from recon_cli.capture.video_colour import BT2020, WIDE_GAMUTS, Transfer, gray_table, to_srgb
+from recon_cli.capture.video_colour import (
+    BT2020,
+    TRANSFERS,
+    WIDE_GAMUTS,
+    Transfer,
+    gray_table,
+    to_srgb,
+)
 
 UNSPECIFIED, RESERVED = 2, 3  # codes of H.273
 # Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
@@ -45,8 +52,6 @@ UNSUPPORTED_MATRICES = {
     15: "IPT-PQ-C2", 16: "YCgCo-Re", 17: "YCgCo-Ro"}
 # One frame per frame, not per field: the rows of the first field stay as recorded.
 BWDIF = "mode=send_frame:parity=auto:deint=interlaced"
-# H.273, table 3: the transfer characteristics of HDR.
-TRANSFERS = {16: Transfer.PQ, 18: Transfer.HLG}
 LOGARITHMIC = (9, 10)  # H.273, table 3: over a range of 100:1 and 316:1
 INVERTED = 1  # libavutil/stereo3d.h: the view of the right eye comes first
 USUAL_SHAPE = 16 / 9  # of the view of one eye

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
+from recon_cli.capture.dng_corrections import describe_corrections, read_corrections
 from recon_cli.capture.foreign import find_foreign, find_lists
 from recon_cli.capture.frame_selection import FrameCandidate, Reason
 from recon_cli.capture.from_video import judge, report_reduced, report_short
@@ -72,6 +73,8 @@ def ingest(
     plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _drop_raw_twins(folder.photos, plan, ctx)
     white = _find_white(photos, ctx)
+    for coding, count in Counter(photo.coding for photo in photos if photo.coding).items():
+        ctx.notice(f"{count} photos are {coding.words}: converted to sRGB as video is.")
     sequence, strangers = None, list[str]()
     if not folder.panoramas:
         photos, sequence, strangers = _find_sequence(
@@ -348,6 +351,8 @@ def _plan_raw(photos: Sequence[Photo], record: Path, ctx: IngestContext) -> RawP
     raw = {photo.name: photo.path for photo in photos if photo.is_raw}
     if not raw:
         return RawPlan({}, {})
+    for text in describe_corrections([read_corrections(path) for path in raw.values()]):
+        ctx.notice(text)
     if record.exists():
         with suppress(FormatError, ManifestError):  # damaged: it is planned again
             plan = RawPlan.from_json(atomic.read_json(record, dict))

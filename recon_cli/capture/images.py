@@ -1,21 +1,20 @@
 """One photo: its upright size, its lens by EXIF, and its pixels as 8-bit RGB.
 
 Pillow reads photos, LibRaw the headers of camera RAW. A photo is read completely or refused with an
-InputError. Colours become sRGB by the embedded profile.
+InputError. Colours become sRGB, see `colour_profile`.
 """
 
 from __future__ import annotations
 
-import math
 import struct
-import warnings
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from threading import Lock
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,41 +23,58 @@ import rawpy
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from recon_cli.capture.colour_profile import to_srgb
+from recon_cli.capture.colour_profile import Coding, convert_coding, read_coding, to_srgb
+from recon_cli.capture.exif import ExifLens, read_exposure, read_lens
+from recon_cli.capture.tiff import (
+    BITS,
+    COMPRESSION,
+    JPEG_XL,
+    LENGTH,
+    WIDTH,
+    UnsupportedError,
+    describe,
+    is_misread,
+    read_directories,
+    read_tiff,
+)
 from recon_cli.capture.xmp import PanoramaArea, is_panorama, panorama_area, read_xmp
 from recon_cli.errors import InputError
-from recon_cli.io.images import fit_size
+from recon_cli.io.images import decode_file, fit_size
+from recon_cli.machine import free_memory_bytes
 
 RAW_SUFFIXES = frozenset({
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".iiq", ".kdc", ".mef",
     ".mos", ".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2",
     ".srf", ".srw", ".x3f"})
 # What cameras and converters write. Pillow also opens documents (EPS by way of Ghostscript).
-FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM")
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "JPEG2000", "PPM", "JXL")
 ANIMATED = frozenset({"WEBP", "PNG", "AVIF", "HEIF"})  # those that may hold a film, or a burst
 # A file with one of these endings that cannot be read is a broken photo; any other is not a photo.
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
-    ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
-    ".ppm", ".tif", ".tiff", ".webp"}
+    ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".jxl", ".pgm",
+    ".png", ".ppm", ".tif", ".tiff", ".webp"}
 # What Pillow and pillow_heif raise on damaged files; OSError includes unidentified ones.
 BROKEN = (
     OSError, SyntaxError, ValueError, EOFError, IndexError, OverflowError, struct.error,
-    RuntimeError, Image.DecompressionBombError)
+    RuntimeError)
 # What undoes each orientation of EXIF 2.32, section 4.6.4; 1 is upright.
 TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_90}
 QUARTER_TURNS = frozenset({5, 6, 7, 8})  # those of them that swap width and height
-RAW_QUARTER_TURNS = frozenset({5, 6})  # LibRaw: flip
-# TIFF 6.0: ImageWidth, ImageLength, BitsPerSample, PlanarConfiguration and its value for planes.
-WIDTH, LENGTH, BITS, PLANAR, APART = 256, 257, 258, 284, 2
-FILM_DIAGONAL = 43.267  # mm; CIPA DCG-001 defines the 35 mm equivalent by the diagonal
-# EXIF 2.32, FocalPlaneResolutionUnit, in mm; 4 and 5 are not in it but in TIFF/EP (ISO 12234-2).
-UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-# Sensors of phones are 4 mm wide, of medium format 54 mm: values far outside are wrong.
-SENSOR_MM = (2.0, 70.0)
+RAW_QUARTER_TURN = 4  # a bit of LibRaw's flip
 
+
+# Bytes of memory for a pixel while it is read: the peaks of pictures of 24 megapixels were 14 to 18
+# (Pillow's copies before and after it is turned, and arrays), and 17 to 30 with 16 bits.
+PIXEL_BYTES, WIDE_PIXEL_BYTES = 20, 32
+# JPEG 2000, ITU-T T.800, A.5.1: how a code stream starts, and the place of the first component's
+# depth behind, one of three bytes each; the number of components lies before it.
+CODE_STREAM, COMPONENTS, DEPTHS = b"\xff\x4f\xff\x51", 40, 42
+JXL_STARTS = (b"\xff\x0a", b"\x00\x00\x00\x0cJXL \r\n\x87\n")
+DAMAGED = "Copy it from the camera again, or leave it out."
+OTHERWISE = "It is not damaged: save it as JPEG, or PNG of 8 or 16 bits, or leave it out."
 
 WHITE = 65535
 GRAY_SIZE = 960  # pixels of the longer side, at least, at which measures are taken
@@ -83,6 +99,7 @@ class Photo:
     panorama: bool = False  # its metadata says that no pinhole camera took it
     area: PanoramaArea | None = None  # of the sphere, where it is equirectangular by its metadata
     exposure_ev: float | None = None  # log2 of exposure time, ISO and aperture, None if unknown
+    coding: Coding | None = None  # of colours that are converted to sRGB, but by an ICC profile
 
     @property
     def name(self) -> str:
@@ -107,18 +124,20 @@ def inspect_photo(path: Path, label: str = "") -> Photo:
     try:
         with open_image(path) as image:
             # before the EXIF, for reading that of a PNG consumes its tiles
-            mode, wide, pictures = image.mode, _is_wide(image), _count_pictures(image)
+            mode, wide, pictures = image.mode, _is_wide(path, image), _count_pictures(image)
+            coding = read_coding(path, image)
             exif, (width, height) = image.getexif(), _size_in_file(image)
             lens = read_lens(exif, width, height)
             exposure, xmp = read_exposure(exif), read_xmp(image)
             panorama = is_panorama(xmp, width, height)
             area = panorama_area(xmp, width, height)
-            if exif.get(ExifTags.Base.Orientation) in QUARTER_TURNS:
+            if _orientation(image) in QUARTER_TURNS:
                 width, height = height, width
     except BROKEN as error:
         raise unreadable_error(path, error) from error
     return Photo(path, width, height, *lens, label=label, mode=mode, wide=wide,
-                 pictures=pictures, panorama=panorama, area=area, exposure_ev=exposure)
+                 pictures=pictures, panorama=panorama, area=area, exposure_ev=exposure,
+                 coding=coding)
 
 
 def _count_pictures(image: Image.Image) -> int:
@@ -150,10 +169,10 @@ def read_gray(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
     try:
         with open_image(photo.path) as image:
             image.draft("L", fit_size(*image.size, GRAY_SIZE))
-            if (image.mode in ("L", "RGB") and not photo.wide
-                    and not image.has_transparency_data):
+            if (image.mode in ("L", "RGB") and not photo.wide and photo.coding is None
+                    and not is_misread(image) and not image.has_transparency_data):
                 gray = image.convert("L")
-                turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
+                turn = TURNS.get(_orientation(image))
                 return np.array(gray if turn is None else gray.transpose(turn))
     except BROKEN as error:
         raise unreadable_error(photo.path, error) from error
@@ -207,22 +226,80 @@ def check_size(photo: Photo, pixels: NDArray[np.uint8]) -> None:
         raise InputError(
             f"{photo.path.name} holds {width}x{height} pixels, but its header says "
             f"{photo.width}x{photo.height}.",
-            hint="Copy it from the camera again, or leave it out.")
+            hint=DAMAGED)
 
 
-def open_image(path: Path) -> Image.Image:
-    """Returns a picture of which only the header has been read."""
-    with warnings.catch_warnings():
-        # Pillow warns from 89 megapixels, which phones reach, and refuses from twice that.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(path, formats=_formats())
+class _AnySize:
+    """Pillow without its limit of 179 megapixels, which holds for all threads of a process.
+
+    Phones take more; and a machine with little memory cannot hold as many.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._users, self._limit = Lock(), 0, Image.MAX_IMAGE_PIXELS
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._users == 0:
+                self._limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                Image.MAX_IMAGE_PIXELS = self._limit
+
+
+_ANY_SIZE = _AnySize()
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """Opens a picture, of which only the header has been read.
+
+    InputError where the memory that is free cannot hold it.
+    """
+    with _ANY_SIZE, Image.open(path, formats=_formats()) as image:
+        if image.format == "TIFF":
+            image.filename = ""  # of a file that it maps to memory, it would turn the size alone
+        width, height = image.size
+        wanted = width * height * (WIDE_PIXEL_BYTES if _is_wide(path, image) else PIXEL_BYTES)
+        if wanted > (free := free_memory_bytes()):
+            raise InputError(
+                f"{path.name} has {width}x{height} pixels: reading it takes {wanted / 1e9:.1f} GB "
+                f"of memory, and {free / 1e9:.1f} GB are free.",
+                hint="Close other programs, or reduce it: a side of 4000 pixels is plenty.")
+        yield image
 
 
 def unreadable_error(path: Path, error: Exception) -> InputError:
     """Returns the error for a picture that a library does not read."""
-    return InputError(
-        f"{path.name} cannot be read: {_reason(path, error)}.",
-        hint="Copy it from the camera again, or leave it out.")
+    reason, hint = _describe_coding(path, error)
+    if not reason:
+        reason, hint = _reason(path, error), (
+            OTHERWISE if isinstance(error, UnsupportedError) else DAMAGED)
+    return InputError(f"{path.name} cannot be read: {reason}.", hint=hint)
+
+
+def _describe_coding(path: Path, error: Exception) -> tuple[str, str]:
+    """Returns why no library knows a picture that is not damaged, and a hint; else ""."""
+    with suppress(*BROKEN):
+        if isinstance(error, rawpy.LibRawFileUnsupportedError) and any(
+                tags.get(COMPRESSION) == JPEG_XL for tags in read_directories(path)):
+            return ("its pixels are compressed by JPEG XL, which LibRaw does not decode",
+                    "It is not damaged: let the camera or Adobe DNG Converter write DNG without "
+                    "JPEG XL, or save it as JPEG or TIFF.")
+        if isinstance(error, UnidentifiedImageError):
+            with path.open("rb") as file:
+                head = file.read(16)
+            if head.startswith(JXL_STARTS):
+                return ("JPEG XL needs the package pillow-jxl-plugin",
+                        "Install it beside recon (python -m pip install pillow-jxl-plugin), or "
+                        "convert the photos: djxl photo.jxl photo.png")
+            if tags := next(iter(read_directories(path)), None):
+                return describe(tags), OTHERWISE
+    return "", ""
 
 
 def _reason(path: Path, error: Exception) -> str:
@@ -235,16 +312,16 @@ def _reason(path: Path, error: Exception) -> str:
         return error.strerror
     words = error.args[0] if error.args else type(error).__name__
     text = words.decode(errors="replace") if isinstance(words, bytes) else str(words)
-    if isinstance(error, Image.DecompressionBombError):
-        return text.split(", could be")[0]  # the rest is about an attack
     return text.split(" (")[0] if text.startswith("image file is truncated") else text.rstrip(".")
 
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Returns those of `FORMATS` that this Pillow knows, with HEIF registered."""
+    """Returns those of `FORMATS` that this Pillow knows, with HEIF, and JPEG XL if installed."""
     Image.init()
     pillow_heif.register_heif_opener()
+    with suppress(ImportError):
+        import pillow_jxl  # noqa: F401  it registers itself
     return tuple(name for name in FORMATS if name in Image.OPEN)
 
 
@@ -252,6 +329,17 @@ def _size_in_file(image: Image.Image) -> tuple[int, int]:
     """Returns width and height before rotation; for a TIFF, Pillow gives those after it."""
     tags = getattr(image, "tag_v2", {})
     return tags.get(WIDTH, image.width), tags.get(LENGTH, image.height)
+
+
+def _orientation(image: Image.Image) -> int:
+    """Returns the orientation by EXIF that its pixels are not turned by yet, 1 if upright.
+
+    libheif has turned HEIC (irot, ISO 23008-12), and cleared that of EXIF. A decoder of JPEG XL has
+    turned the picture too (ISO 18181-2), but for one that is a JPEG, repacked.
+    """
+    if image.format == "JXL" and not getattr(image, "jpeg", False):
+        return 1
+    return int(image.getexif().get(ExifTags.Base.Orientation, 1))
 
 
 def find_white(paths: Iterable[Path]) -> int:
@@ -262,10 +350,11 @@ def find_white(paths: Iterable[Path]) -> int:
     """
     brightest = 0
     for path in paths:
-        with suppress(*BROKEN), open_image(path) as image:
-            if _is_wide(image):
-                values = np.asarray(image) if image.mode[0] == "I" else _read_wide(path, image)
-                brightest = max(brightest, int(values.max()))
+        with suppress(*BROKEN, InputError), open_image(path) as image:
+            if _is_wide(path, image):
+                values = _read_wide(path, image)
+                colours = values if values.ndim == 2 else values[..., :3]
+                brightest = max(brightest, int(colours.max()))
         if brightest > max(NARROW):
             return WHITE
     return next((white for white in NARROW if 0 < brightest <= white), WHITE)
@@ -279,68 +368,103 @@ def describe_white(count: int, white: int) -> str:
 
 def is_wide(path: Path) -> bool:
     """Returns whether a picture that can be read has values of 16 bits."""
-    with suppress(*BROKEN), open_image(path) as image:
-        return _is_wide(image)
+    with suppress(*BROKEN, InputError), open_image(path) as image:
+        return _is_wide(path, image)
     return False
 
 
 def _decode(path: Path, *, upright: bool, white: int = WHITE) -> Image.Image:
-    """Returns a picture of 8 bits a channel, in any mode, if `upright` rotated as EXIF says.
-
-    libheif has already rotated HEIC (irot, ISO 23008-12) and cleared the EXIF orientation.
-    """
+    """Returns a picture of 8 bits a channel, in any mode, if `upright` rotated as EXIF says."""
     try:
         with open_image(path) as image:
             image.verify()  # checksums, which loading ignores; consumes the image
         with open_image(path) as image:
+            coding = read_coding(path, image)
+            stored = getattr(image, "tag_v2", {}).get(ExifTags.Base.Orientation, 1)
             # first: reading the EXIF of a PNG consumes its tiles
-            eight = to_srgb(_eight_bits(path, image, white))
-            turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
-            return eight.transpose(turn) if upright and turn is not None else eight
+            eight = (to_srgb(_eight_bits(path, image, white)) if coding is None
+                     else convert_coding(*_read_signal(path, image), coding))
+            turn = TURNS.get(_orientation(image))
+            if not upright:  # what Pillow loads of a TIFF it has turned; 6 and 8 undo each other
+                turn = TURNS.get({6: 8, 8: 6}.get(stored, stored)) if turn is None else None
+            return eight if turn is None else eight.transpose(turn)
     except BROKEN as error:
         raise unreadable_error(path, error) from error
 
 
 def _eight_bits(path: Path, image: Image.Image, white: int) -> Image.Image:
     if image.mode == "F":
-        raise ValueError("its pixels are floating point, of unknown range")
-    if image.mode[0] == "I":
-        return Image.fromarray(_to_8bit(np.asarray(image), white))
-    if not _is_wide(image):
+        raise UnsupportedError("its pixels are floating point, of unknown range")
+    if not _is_wide(path, image) and not is_misread(image):
         image.load()
-        return image
-    eight = Image.fromarray(_to_8bit(_read_wide(path, image), white))
+        return image.convert("LA") if image.mode == "La" else image  # it has no way to RGB
+    eight = Image.fromarray(_to_8bit(
+        _read_wide(path, image), white if _is_wide(path, image) else WHITE))
     if profile := image.info.get("icc_profile"):
         eight.info["icc_profile"] = profile
     return eight
 
 
-def _is_wide(image: Image.Image) -> bool:
-    """Returns whether values have 16 bits; of colours Pillow would drop the lower half."""
+def _is_wide(path: Path, image: Image.Image) -> bool:
+    """Returns whether values have more than 8 bits; of colours Pillow would drop the others."""
     if image.mode[0] == "I" or max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
         return True
-    return any(";16" in str(tile.args) for tile in getattr(image, "tile", ()))
+    if image.format == "JPEG2000":
+        return _jpeg2000_white(path) > 255
+    return any(";16B" in str(tile.args) for tile in getattr(image, "tile", ()))  # BGR;16 is 5-6-5
 
 
-def _read_wide(path: Path, image: Image.Image) -> NDArray[np.uint16]:
-    """Returns colours of 16 bits, RGB or RGBA, [H, W, 3 or 4]."""
-    if getattr(image, "tag_v2", {}).get(PLANAR) == APART:  # read wrongly by Pillow and OpenCV
-        raise ValueError("its colours have 16 bits in separate planes, which is not supported")
-    wide = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    if wide is None or wide.dtype != np.uint16 or wide.ndim != 3:
-        raise ValueError(f"its pixels of {image.mode} with 16 bits cannot be decoded")
-    if image.format == "TIFF":  # OpenCV has turned it, whatever the flags
-        image.getexif()[ExifTags.Base.Orientation] = 1
-    order = cv2.COLOR_BGR2RGB if wide.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-    return np.asarray(cv2.cvtColor(wide, order), np.uint16)
+def _jpeg2000_white(path: Path) -> int:
+    """Returns the brightest value of a JPEG 2000 of unsigned samples; 255 if it is damaged."""
+    data = path.read_bytes()
+    start = data.find(CODE_STREAM)
+    if start < 0 or start + DEPTHS > len(data):
+        return 255
+    count, = struct.unpack_from(">H", data, start + COMPONENTS)
+    depths = data[start + DEPTHS:start + DEPTHS + 3 * count:3]
+    return (1 << max(depths, default=7) % 128 + 1) - 1
+
+
+def _read_wide(path: Path, image: Image.Image) -> NDArray[Any]:
+    """Returns values of 16 bits, gray [H, W] or RGB or RGBA [H, W, 3 or 4]."""
+    if is_misread(image):
+        return read_tiff(path, image)
+    if image.mode[0] == "I" and image.format != "JPEG2000":
+        return np.asarray(image)
+    wide = None if image.mode == "LA" and image.format == "JPEG2000" else decode_file(
+        path, cv2.IMREAD_UNCHANGED)
+    if wide is None or wide.dtype != np.uint16 or image.mode == "CMYK":
+        raise UnsupportedError(f"its pixels of {image.mode} with 16 bits are not supported")
+    if wide.ndim == 3:
+        wide = cv2.cvtColor(
+            wide, cv2.COLOR_BGR2RGB if wide.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+    if image.format == "JPEG2000" and (white := _jpeg2000_white(path)) < WHITE:
+        wide = (wide.astype(np.uint32) * WHITE // white).astype(np.uint16)
+    return np.asarray(wide, np.uint16)
+
+
+def _read_signal(path: Path, image: Image.Image) -> tuple[NDArray[np.uint16], int]:
+    """Returns a picture as coded, [H, W, 3 or 4], and the value of its white."""
+    bits = image.info.get("bit_depth", 8) if image.format == "HEIF" else 8
+    if bits > 8:
+        deep = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
+        values, white = np.asarray(deep), 65536 - (1 << 16 - bits)
+    elif _is_wide(path, image) or is_misread(image):
+        values, white = np.asarray(_read_wide(path, image)), WHITE
+    else:
+        image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+        values, white = np.asarray(image).astype(np.uint16) * (WHITE // 255), WHITE
+    if values.ndim == 2:
+        values = np.repeat(values[..., None], 3, axis=2)
+    return np.asarray(values, np.uint16), white
 
 
 def _to_8bit(wide: NDArray[Any], white: int) -> NDArray[np.uint8]:
     """Returns 16-bit values in 8 bits; `white` becomes 255."""
     if wide.size and (wide.min() < 0 or wide.max() > WHITE):  # a mode of 32 bits
         raise ValueError(f"its pixels reach from {wide.min()} to {wide.max()}, not to {WHITE}")
-    scaled = (wide.astype(np.uint32) * 255 + white // 2) // white
-    return np.minimum(scaled, 255).astype(np.uint8)
+    return np.asarray(cv2.convertScaleAbs(wide.astype(np.uint16, copy=False), alpha=255 / white),
+                      np.uint8)
 
 
 def open_raw(path: Path) -> rawpy.RawPy:
@@ -363,73 +487,6 @@ def _inspect_raw(path: Path) -> Photo:
     with suppress(*BROKEN), path.open("rb") as file:
         exif.load_from_fp(file)
         lens = read_lens(exif, width, height)
-    if sizes.flip in RAW_QUARTER_TURNS:
+    if sizes.flip & RAW_QUARTER_TURN:
         width, height = height, width
     return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm or focal or None)
-
-
-class ExifLens(NamedTuple):
-    """The optics by EXIF, in the order of the fields of `Photo`."""
-
-    focal_px: float | None = None
-    camera: str = ""  # maker and model
-    focal_mm: float | None = None
-
-
-def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
-    """Returns camera and focal length of a picture of width x height pixels, as stored.
-
-    The focal length in pixels comes from the 35 mm equivalent, by the diagonal, else from that in
-    mm and the resolution of the focal plane (EXIF 2.32, section 4.6.5).
-    """
-    detail = exif.get_ifd(ExifTags.IFD.Exif)
-    focal = _positive(detail.get(ExifTags.Base.FocalLength))
-    film = _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    pixels = None
-    if film is not None:
-        pixels = math.hypot(width, height) * film / FILM_DIAGONAL
-    elif focal is not None:
-        sensor = _sensor_mm(detail)
-        pixels = None if sensor is None else max(width, height) * focal / sensor
-    maker, model = (
-        str(exif.get(tag) or "").strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
-    camera = model if model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
-    return ExifLens(pixels, camera, focal)
-
-
-def read_exposure(exif: Image.Exif) -> float | None:
-    """Returns log2(t S / (100 N^2)) of exposure time t, ISO S and f-number N; None without t or S.
-
-    A lens that never gives its f-number, as of most phones, is taken to keep it.
-    """
-    detail = exif.get_ifd(ExifTags.IFD.Exif)
-    seconds, f_number = (
-        _positive(detail.get(tag)) for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber))
-    sensitivity = detail.get(ExifTags.Base.ISOSpeedRatings)
-    if isinstance(sensitivity, tuple) and sensitivity:  # EXIF 2.2 allows several
-        sensitivity = sensitivity[0]
-    iso = _positive(sensitivity)
-    if seconds is None or iso is None:
-        return None
-    return math.log2(seconds * iso / 100) - 2 * math.log2(f_number or 1.0)
-
-
-def _sensor_mm(detail: dict[int, Any]) -> float | None:
-    """Returns the length of the sensor's longer side."""
-    density = _positive(detail.get(ExifTags.Base.FocalPlaneXResolution))
-    sides = (_positive(detail.get(tag)) or 0.0
-             for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
-    unit = UNIT_MM.get(detail.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
-    if density is None or unit is None:
-        return None
-    size = max(sides) / density * unit
-    return size if SENSOR_MM[0] <= size <= SENSOR_MM[1] else None
-
-
-def _positive(value: Any) -> float | None:
-    """Returns a positive EXIF number; None for text, zero or a fraction over zero."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None

@@ -1,13 +1,15 @@
 """Camera RAW: a set of photos is developed alike, so that a point has one colour in all of them.
 
 One white balance and one saturation per camera, one brightness for the whole set, and differences
-of exposure are undone. What LibRaw would choose per photo (brightness, maximum) is switched off.
+of exposure are undone. What LibRaw would choose per photo (brightness, maximum) is switched off,
+and what it leaves out of a DNG is added (`dng_corrections`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +20,7 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
+from recon_cli.capture.dng_corrections import Warp, correct_shading, read_corrections, turn
 from recon_cli.capture.images import Photo, check_size, open_raw, unreadable_error
 from recon_cli.capture.raw_exposure import RawMeasures, exposures, measure_view, nominal_ev
 from recon_cli.errors import InputError
@@ -106,10 +109,14 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
         raise InputError(
             plan.broken[photo.name], hint="Copy it from the camera again, or leave it out.")
     try:
-        with open_raw(photo.path) as raw:
+        with _open_corrected(photo.path) as (raw, warp):
+            flip = raw.sizes.flip
             rgb = np.asarray(raw.postprocess(
                 **_develop_options(shot.multipliers, shot.saturation), bright=2.0 ** shot.gain_ev,
-                gamma=SRGB, output_color=rawpy.ColorSpace.sRGB, output_bps=8), np.uint8)
+                gamma=SRGB, output_color=rawpy.ColorSpace.sRGB, output_bps=8,
+                user_flip=None if warp is None else 0), np.uint8)
+            if warp is not None:
+                rgb = turn(warp.apply(rgb), flip)
     except rawpy.LibRawError as error:
         raise unreadable_error(photo.path, error) from error
     check_size(photo, rgb)
@@ -121,6 +128,15 @@ def _develop_options(multipliers: Sequence[float], saturation: int) -> dict[str,
     return {
         "user_wb": list(multipliers), "user_sat": saturation, "no_auto_bright": True,
         "adjust_maximum_thr": 0.0, "highlight_mode": rawpy.HighlightMode.Clip}
+
+
+@contextmanager
+def _open_corrected(path: Path) -> Iterator[tuple[rawpy.RawPy, Warp | None]]:
+    """Opens a RAW photo without the shading of its lens; yields its distortion, too."""
+    corrections = read_corrections(path)
+    with open_raw(path) as raw:
+        correct_shading(raw, corrections.gains)
+        yield raw, corrections.warp
 
 
 def _try_read(
@@ -137,7 +153,7 @@ def _try_read(
 
 
 def _read_header(path: Path) -> _Header:
-    with open_raw(path) as raw:
+    with _open_corrected(path) as (raw, _):
         shot, white = raw.other, int(raw.white_level)
         highest = int(raw.raw_image_visible.max())
         if highest == 0:  # how LibRaw answers a compression that it does not know
@@ -175,7 +191,7 @@ def _by_camera(headers: Sequence[_Header]) -> dict[tuple[object, ...], CameraSet
 
 
 def _measure(path: Path, shared: CameraSettings) -> RawMeasures:
-    with open_raw(path) as raw:
+    with _open_corrected(path) as (raw, _):
         wide = raw.postprocess(
             **_develop_options(*shared), half_size=True, gamma=(1, 1),
             output_color=rawpy.ColorSpace.raw, output_bps=16)

@@ -1,11 +1,12 @@
-"""Colours of video as sRGB: HDR (HLG or PQ) and SDR of wide gamut (BT.2020, Display P3).
+"""Colours of video and photos as sRGB: HDR (HLG or PQ) and SDR of wide gamut (BT.2020, P3).
 
 HDR becomes sRGB with BT.709 primaries: the EOTF of ITU-R BT.2100 (for HLG with the OOTF of a
 display of 1000 cd/m2), then the EETF of Report BT.2408, Annex 5, down to the white of SDR. It is
 applied to the largest of R, G and B, which keeps the hue, with the same peak for all frames.
 
 SDR is read as sRGB whatever its tag, as video of BT.709 is: grays stay, and only the primaries are
-converted. Colours that BT.709 cannot show are clipped.
+converted. Colours that BT.709 cannot show are clipped. Adobe RGB (1998), of photos, has no code in
+H.273 and a power for its curve.
 """
 
 from __future__ import annotations
@@ -36,7 +37,11 @@ PRIMARIES = {
     BT2020: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
     P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))}
 PRIMARIES[DCI_P3] = PRIMARIES[P3]
-WIDE_GAMUTS = {BT2020: "BT.2020", DCI_P3: "P3", P3: "Display P3"}
+# Adobe RGB (1998) Color Image Encoding, 4.3.1: beyond the codes of H.273, which are bytes.
+ADOBE_RGB, ADOBE_GAMMA = 256, 563 / 256
+PRIMARIES[ADOBE_RGB] = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))
+WIDE_GAMUTS = {
+    BT2020: "BT.2020", DCI_P3: "P3", P3: "Display P3", ADOBE_RGB: "Adobe RGB"}
 D65 = (0.3127, 0.3290)
 # Steps of the gain over the root of the light: neighbours differ by less than 0.2 %.
 GAIN_STEPS = 4096
@@ -46,10 +51,13 @@ STRIP = 1 << 15
 
 
 class Transfer(Enum):
-    """The transfer functions of HDR video."""
+    """The transfer functions of HDR."""
 
     HLG = "HLG"
     PQ = "PQ"
+
+
+TRANSFERS = {16: Transfer.PQ, 18: Transfer.HLG}  # by the code of H.273, table 3
 
 
 def pq_light(signal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -110,16 +118,17 @@ def to_srgb(
 ) -> NDArray[np.uint8]:
     """Returns a signal [H, W, 3] from 0 to `white` as sRGB bytes [H, W, 3].
 
-    `transfer` is None for SDR. `primaries` is an H.273 code; any that is not in `PRIMARIES` is
-    taken as BT.709 in SDR and as BT.2020 in HDR.
+    `transfer` is None for SDR. `primaries` is an H.273 code or `ADOBE_RGB`; any that is not in
+    `PRIMARIES` is taken as BT.709 in SDR and as BT.2020 in HDR.
     """
     if primaries not in PRIMARIES:
         primaries = BT709 if transfer is None else BT2020
     pixels = rgb.reshape(-1, 1, 3)
     srgb = np.empty(pixels.shape, np.uint8)
     to_bt709, luminance = _matrices(primaries)
+    table = _light_table(transfer, white, primaries == ADOBE_RGB)
     for start in range(0, len(pixels), STRIP):
-        light = _light_table(transfer, white).take(pixels[start:start + STRIP])
+        light = table.take(pixels[start:start + STRIP])
         linear = cv2.transform(light, to_bt709)
         if transfer is Transfer.HLG:
             # The OOTF scales all three by a power of the luminance, so the matrix may come first.
@@ -147,13 +156,17 @@ def _scale(rgb: NDArray[np.float32], factor: NDArray[np.float32]) -> NDArray[np.
 
 
 @cache
-def _light_table(transfer: Transfer | None, white: int) -> NDArray[np.float32]:  # [65536]
+def _light_table(
+    transfer: Transfer | None, white: int, adobe: bool
+) -> NDArray[np.float32]:  # [65536]
     """Returns the light of each signal: of the scene for HLG, in units of the peak or of white."""
     signal = np.minimum(np.arange(65536) / white, 1)
     if transfer is Transfer.HLG:
         return hlg_scene(signal).astype(np.float32)
     if transfer is Transfer.PQ:
         return np.minimum(pq_light(signal) / PEAK, 1).astype(np.float32)
+    if adobe:
+        return (signal**ADOBE_GAMMA).astype(np.float32)
     return srgb_light(signal).astype(np.float32)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,7 +16,7 @@ BLACK, WHITE = 512, 16383  # a sensor of 14 bits
 SRGB_OF_XYZ = np.array([
     [3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 RESPONSE = (0.5, 1.0, 0.625)  # of the sensor's red, green and blue to white light
-BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
+BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 SIZES = {BYTE: "B", SHORT: "H", LONG: "I"}
 Entry = tuple[int, int, object]  # tag, type, values
 
@@ -33,6 +34,8 @@ class Shot:
         focal_35mm: 35 mm equivalent of the focal length.
         orientation: as EXIF counts.
         model: name of the camera.
+        more: other tags with opaque values, by tag.
+        demosaiced: whether the colours of all pixels are stored instead of a mosaic.
     """
 
     seconds: Fraction = Fraction(1, 60)
@@ -43,6 +46,8 @@ class Shot:
     focal_35mm: int = 26
     orientation: int = 1
     model: str = "Mosaic One"
+    more: Mapping[int, bytes] = field(default_factory=dict)
+    demosaiced: bool = False
 
 
 def linear(rgb: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -58,24 +63,33 @@ def mosaic(light: NDArray[np.float64]) -> NDArray[np.uint16]:
     cells = np.empty((height, width))
     for (y, x), channel in {(0, 0): 0, (0, 1): 1, (1, 0): 1, (1, 1): 2}.items():
         cells[y::2, x::2] = seen[y:height:2, x:width:2, channel]
-    return np.clip(np.round(BLACK + cells * (WHITE - BLACK)), 0, WHITE).astype(np.uint16)
+    return _quantized(cells)
+
+
+def _quantized(values: NDArray[np.float64]) -> NDArray[np.uint16]:
+    return np.clip(np.round(BLACK + values * (WHITE - BLACK)), 0, WHITE).astype(np.uint16)
 
 
 def write_shot(path: Path, light: NDArray[np.float64], shot: Shot) -> Path:
     """Writes light [H, W, 3] as it falls onto the sensor, exposure included, as a DNG."""
-    cells = mosaic(light)
-    height, width = cells.shape
+    cells = _quantized(light * RESPONSE) if shot.demosaiced else mosaic(light)
+    height, width = cells.shape[:2]
     pixels = cells.astype("<u2").tobytes()
     matrix = (np.diag(RESPONSE) @ SRGB_OF_XYZ).ravel()
+    planes = 3 if shot.demosaiced else 1
     main: list[Entry] = [
-        (254, LONG, [0]), (256, LONG, [width]), (257, LONG, [height]), (258, SHORT, [16]),
-        (259, SHORT, [1]), (262, SHORT, [32803]), (271, ASCII, "Test"), (272, ASCII, shot.model),
-        (273, LONG, [8]), (274, SHORT, [shot.orientation]), (277, SHORT, [1]),
-        (278, LONG, [height]), (279, LONG, [len(pixels)]), (33421, SHORT, [2, 2]),
-        (33422, BYTE, [0, 1, 1, 2]), (50706, BYTE, [1, 4, 0, 0]), (50707, BYTE, [1, 1, 0, 0]),
-        (50708, ASCII, f"Test {shot.model}"), (50714, SHORT, [BLACK]), (50717, LONG, [WHITE]),
-        (50721, SRATIONAL, matrix), (50728, RATIONAL, shot.neutral), (50778, SHORT, [21]),
+        (254, LONG, [0]), (256, LONG, [width]), (257, LONG, [height]), (258, SHORT, [16] * planes),
+        (259, SHORT, [1]), (262, SHORT, [34892 if shot.demosaiced else 32803]),
+        (271, ASCII, "Test"), (272, ASCII, shot.model), (273, LONG, [8]),
+        (274, SHORT, [shot.orientation]), (277, SHORT, [planes]), (278, LONG, [height]),
+        (279, LONG, [len(pixels)]), (50706, BYTE, [1, 4, 0, 0]), (50707, BYTE, [1, 1, 0, 0]),
+        (50708, ASCII, f"Test {shot.model}"), (50714, SHORT, [BLACK] * planes),
+        (50717, LONG, [WHITE] * planes), (50721, SRATIONAL, matrix),
+        (50728, RATIONAL, shot.neutral), (50778, SHORT, [21]),
+        *((tag, UNDEFINED, value) for tag, value in shot.more.items()),
     ]
+    if not shot.demosaiced:
+        main += [(33421, SHORT, [2, 2]), (33422, BYTE, [0, 1, 1, 2])]
     detail: list[Entry] = [
         (33434, RATIONAL, [shot.seconds]), (33437, RATIONAL, [shot.f_number]),
         (34855, SHORT, [shot.iso]), (37386, RATIONAL, [Fraction(436, 100)]),
@@ -108,6 +122,8 @@ def _packed(kind: int, content) -> tuple[bytes, int]:
     if kind == ASCII:
         data = content.encode() + b"\0"
         return data, len(data)
+    if kind == UNDEFINED:
+        return content, len(content)
     if kind in SIZES:
         return struct.pack(f"<{len(content)}{SIZES[kind]}", *content), len(content)
     fractions = [Fraction(value).limit_denominator(1_000_000) for value in content]

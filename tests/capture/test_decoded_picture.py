@@ -35,7 +35,6 @@ from media import (
 
 from recon_cli.capture.decoded_picture import (
     ROUNDED,
-    TRANSFERS,
     DecodedPicture,
     Gap,
     Tags,
@@ -47,6 +46,7 @@ from recon_cli.capture.video import decode, frames_at
 from recon_cli.capture.video_colour import (
     PEAK,
     SDR_WHITE,
+    TRANSFERS,
     Transfer,
     hlg_scene,
     pq_light,
