@@ -27,11 +27,11 @@ _ENOUGH, _SPREAD = 50, 0.25
 # if its sizes are read as logarithms.
 _COVERED = 1.0
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
-ROUNDING = 0.1  # of the median Gaussian's size: positions that move by more look different
+_ROUNDING = 0.1  # of the median Gaussian's size: float32 cannot hold positions that move by more
 _MOST_DEGREE = 10
 _MOST_LOG_OPACITY = -1e-15  # an opacity of exactly 1 has no logit
 NOT_GAUSSIANS_HINT = (
-    "Give a file of Gaussians, as `recon train` and other trainers of 3D Gaussian Splatting write.")
+    "Give a file of Gaussians, as programs that train 3D Gaussian Splatting write it.")
 FLAT = math.log(1e-6)  # log scale of a flat Gaussian, as SuperSplat sets it
 
 logger = logging.getLogger("recon")
@@ -155,7 +155,7 @@ def find_origin(means: NDArray[Any], log_scales: NDArray[Any]) -> Origin | None:
     middle = np.median(means.astype(np.float64), axis=0)
     rounding = float(np.spacing(np.float32(np.abs(middle).max()))) / 2
     size = math.exp(float(np.median(log_scales)))
-    if not ROUNDING * size < rounding < math.inf:
+    if not _ROUNDING * size < rounding < math.inf:
         return None
     rounded = np.rint(middle)
     x, y, z = (float(value) for value in (rounded if rounded.any() else middle))
