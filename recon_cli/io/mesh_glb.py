@@ -17,11 +17,11 @@ from recon_cli.io.mesh_data import Mesh, Texture
 from recon_cli.workspace.atomic import parse_json
 
 _UNLIT = "KHR_materials_unlit"  # the photos hold the light of the room already
-# Linear light of each sRGB code (IEC 61966-2-1), which glTF wants in COLOR_0, in 16 bits: 8 would
-# merge the dark codes
+# Linear light of each sRGB code (IEC 61966-2-1), which glTF wants in COLOR_0: 8 bits would merge
+# the dark codes, and of 16 trimesh and MeshLab read the lower 8
 _CODES = np.arange(256) / 255
-_LIGHT = np.rint(65535 * np.where(
-    _CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4)).astype(np.uint16)
+_LIGHT = np.where(
+    _CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4).astype(np.float32)
 _MIMES = {"png": "image/png", "jpg": "image/jpeg"}
 _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071  # filters and wrapping of WebGL
 _TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -46,7 +46,7 @@ def glb_bytes(mesh: Mesh, tint: tuple[float, float, float] | None) -> bytes:
         if part.texture is not None:
             attributes["_CORNERS"] = part.texture.corners.astype(np.float32)
         else:
-            opaque = np.full((len(part.colors), 1), 65535, np.uint16)
+            opaque = np.ones((len(part.colors), 1), np.float32)
             attributes["_COLOR"] = np.concatenate([_LIGHT[part.colors], opaque], axis=1)
         scene.add_geometry(trimesh.Trimesh(
             part.vertices.astype(np.float32), part.faces, vertex_attributes=attributes,
@@ -70,8 +70,6 @@ def glb_bytes(mesh: Mesh, tint: tuple[float, float, float] | None) -> bytes:
             attributes = primitive["attributes"]
             for name in set(attributes) & _RENAMED.keys():
                 attributes[_RENAMED[name]] = attributes.pop(name)
-            if "COLOR_0" in attributes:
-                tree["accessors"][attributes["COLOR_0"]]["normalized"] = True
             primitive["material"] = number
         tree["materials"] = [_material(name, mesh.texture, tint) for name in names]
         tree["extensionsUsed"] = [*tree.get("extensionsUsed", ()), _UNLIT]
@@ -106,6 +104,8 @@ def read_glb(path: Path) -> Mesh:
         found = np.frombuffer(
             data, _TYPES[accessor["componentType"]], width * accessor["count"],
             start + view.get("byteOffset", 0) + accessor.get("byteOffset", 0))
+        if accessor.get("normalized"):
+            found = found / np.iinfo(found.dtype).max
         return found.reshape(-1, width) if width > 1 else found
 
     columns: dict[str, list[NDArray[Any]]] = {}
@@ -133,8 +133,7 @@ def read_glb(path: Path) -> Mesh:
     return Mesh(found["POSITION"].astype(np.float64), np.concatenate(faces), colors, marks, texture)
 
 
-def _codes(light: NDArray[np.uint16]) -> NDArray[np.uint8]:
+def _codes(light: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     """Returns the sRGB codes of linear light, which trimesh would round to 8 bits."""
-    after = np.searchsorted(_LIGHT, light).clip(1, 255)
-    below = light - _LIGHT[after - 1].astype(int) < _LIGHT[after].astype(int) - light
-    return np.asarray(after - below, np.uint8)
+    middles = (_LIGHT[1:].astype(np.float64) + _LIGHT[:-1]) / 2
+    return np.searchsorted(middles, light).astype(np.uint8)

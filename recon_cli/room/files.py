@@ -25,8 +25,11 @@ logger = logging.getLogger("recon")
 def write_mesh_file(
     path: Path, mesh: Mesh, up: NDArray[np.float64], *, tint: bool = False
 ) -> Path:
-    """Writes a mesh, reads it back and compares; a .glb gets the axes of glTF."""
-    axes = nearest_axes(up) if path.suffix == ".glb" else None
+    """Writes a mesh, reads it back and compares; a .glb and an .obj get the axes of glTF.
+
+    Blender and game engines take y for up in an .obj as well.
+    """
+    axes = nearest_axes(up) if path.suffix in (".glb", ".obj") else None
     write_mesh(path, mesh, axes=axes, tint=tint)
     _verify_mesh(path, mesh, axes, tint)
     return path

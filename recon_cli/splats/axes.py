@@ -8,6 +8,7 @@ Only signs change. The numbers are those of the extension 0xADBE0003 of SPZ
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,17 @@ UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0), "y": (0.0, 1.0, 0.0)}
 def nearest_up(up: NDArray[np.float64]) -> str:
     """Returns z, -y or y, whichever is nearest to a unit vector [3]."""
     return max(UP, key=lambda name: float(np.dot(UP[name], up)))
+
+
+def up_comment(up: str | None) -> str:
+    """Returns the text by which files whose format has no field for it say which axis is up."""
+    return "recon" if up is None else f"recon up={up}"
+
+
+def read_up_comment(text: str) -> str | None:
+    """Returns the axis in a text of `up_comment`; None if there is none, or it is another text."""
+    found = re.fullmatch(r"recon up=(z|-y|y)", text)
+    return found[1] if found else None
 
 
 def up_of(axes: str) -> str:

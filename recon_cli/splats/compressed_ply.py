@@ -9,6 +9,7 @@ Source of the layout: https://github.com/playcanvas/splat-transform.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.splats.foreign import count_terms, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
-from recon_cli.splats.ply import describe_writer, is_antialiased, read_up
+from recon_cli.splats.ply import describe_settings, describe_writer, is_antialiased, read_up
 from recon_cli.splats.ply_tables import Element, format_header, read_header, read_tables
 from recon_cli.splats.values import (
     Bytes,
@@ -53,9 +54,12 @@ Words = NDArray[np.uint32]
 
 
 def write_compressed_ply(
-    path: Path, splats: Splats, *, centers: NDArray[np.float64] | None = None
+    path: Path, splats: Splats, *, centers: NDArray[np.float64] | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
+
+    `comments` go into the header.
 
     Far outliers come first: in a chunk of the room they would leave the others no bits.
     The Gaussians of the room that fill the last chunk of these lose theirs, so they are the most
@@ -83,17 +87,18 @@ def write_compressed_ply(
         _join_bits(scale, _BITS, _SHIFTS),
         _join_bits(color, (8, 8, 8), (24, 16, 8)) | alpha], axis=1)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(splats), sh_rest.shape[1]))
+        file.write(_header(len(splats), sh_rest.shape[1], comments))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
         file.write(words.astype("<u4").tobytes())
         file.write(harmonics.tobytes())
 
 
-def _header(n: int, terms: int) -> bytes:
+def _header(n: int, terms: int, comments: Sequence[str]) -> bytes:
     rest = [f"uchar f_rest_{i}" for i in range(3 * terms)]
     return format_header({
         "chunk": (-(-n // _CHUNK), [f"float {name}" for name in _BOUNDS]),
-        "vertex": (n, [f"uint {name}" for name in _PACKED]), **({"sh": (n, rest)} if rest else {})})
+        "vertex": (n, [f"uint {name}" for name in _PACKED]), **({"sh": (n, rest)} if rest else {})},
+        comments)
 
 
 def _bound_chunks(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
@@ -236,7 +241,8 @@ def _decode_harmonics(coded: Bytes) -> Floats:
 def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
     seen_from = evenly_spread(settings.views, _MOST_CENTERS)
     centers = np.stack([camera.center for _, camera in seen_from]) if seen_from else None
-    write_compressed_ply(path, splats.with_sphere(), centers=centers)
+    write_compressed_ply(path, splats.with_sphere(), centers=centers,
+                         comments=describe_settings(settings))
 
 
 FORMAT = SplatFormat(load_compressed_ply, _write_with)

@@ -29,6 +29,9 @@ _COVERED = 1.0
 _BULK = 0.9  # share of the Gaussians that determines the size of the scene
 _ROUNDING = 0.1  # of the median Gaussian's size: float32 cannot hold positions that move by more
 _MOST_DEGREE = 10
+_MOST_LOG_OPACITY = -1e-15  # an opacity of exactly 1 has no logit
+NOT_GAUSSIANS_HINT = (
+    "Give a file of Gaussians, as programs that train 3D Gaussian Splatting write it.")
 FLAT = math.log(1e-6)  # log scale of a flat Gaussian, as SuperSplat sets it
 
 logger = logging.getLogger("recon")
@@ -83,6 +86,37 @@ def warn_of_degree(path: Path, degree: int) -> None:
     if degree > most:
         logger.warning("%s: harmonics of degree %d are cut to degree %d, so colours change a "
                        "little with the view", path.name, degree, most)
+
+
+def accept_surplus(path: Path, count: int, row: float = math.inf) -> None:
+    """Warns of `count` bytes after the data, which are left out; FormatError if they fill a row.
+
+    Programs pad files or end them with a line break; a whole row means that the header is wrong.
+    """
+    if count >= row:
+        raise FormatError(
+            f"{path} holds {count:,} bytes more than its header promises, at least a Gaussian: it "
+            "is damaged.", hint="Write or copy the file again.")
+    if count:
+        logger.warning("%s: %s bytes after its data are left out", path.name, f"{count:,}")
+
+
+def add_filter(path: Path, columns: Columns, sizes: NDArray[Any]) -> None:
+    """Widens Gaussians by the 3D filter of Mip-Splatting [N], in place, with a warning.
+
+    Mip-Splatting (Yu et al. 2024, equation 9), and GOF and RaDe-GS after it, keep the filter's size
+    f in `filter_3D`; they draw sizes of sqrt(s^2 + f^2), and opacities times the ratio of volumes.
+    """
+    before = columns["log_scales"].astype(np.float64)
+    logits = columns["logit_opacities"].astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a filter of 0 changes nothing
+        after = np.logaddexp(2 * before, 2 * np.log(np.abs(sizes.astype(np.float64)))[:, None]) / 2
+    shrunk = -np.logaddexp(0, -logits) + (before - after).sum(axis=1)  # log of the opacity
+    columns["log_scales"] = after.astype(np.float32)
+    columns["logit_opacities"] = (shrunk - np.log(-np.expm1(
+        np.minimum(shrunk, _MOST_LOG_OPACITY)))).astype(np.float32)
+    logger.warning("%s: the 3D filter of Mip-Splatting (filter_3D) is added to sizes and opacities",
+                   path.name)
 
 
 def undo_activations(path: Path, columns: Columns) -> Columns:

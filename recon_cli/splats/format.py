@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.axes import nearest_up
 
 SHARING = 16
 
@@ -81,6 +82,11 @@ class WriteSettings:
     guide: Callable[[Splats], Guide | None] | None = None  # makes it, which takes seconds
     options: Mapping[str, Any] = field(default_factory=dict)  # those that the format's row names
     sharing: int = SHARING  # Gaussians per entry of a palette of colours, on the mean
+
+    @property
+    def up_axis(self) -> str | None:
+        """The axis that is nearest to up: z, -y or y; None where up is not known."""
+        return None if self.up is None else nearest_up(self.up)
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,10 @@
 One primitive of points: POSITION; ROTATION, a unit quaternion xyzw; SCALE, the standard deviations
 themselves; OPACITY, after the sigmoid; SH_DEGREE_l_COEF_n, in INRIA's basis, signs and order; and
 COLOR_0 for programs that know nothing of Gaussians, linear as all colours of vertices in glTF. All
-are float32 but COLOR_0, which has 16 bits: 8 are too few for dark linear colours. Drafts of the
-extension had logarithms in SCALE; a file that has numbers below 0 there is refused.
+are float32: 8 bits are too few for dark linear colours, and of 16 trimesh and MeshLab read the
+lower 8. Drafts of the extension had logarithms in SCALE; a file that has numbers below 0 there is
+refused. A program that does not know the extension keeps the attributes and may leave out its
+entry; such a file is read, with a warning.
 
 The world of glTF is right-handed with +Y up. A scene is rotated into it, with its coefficients,
 when it is written, and back when it is read: by `Z_UP` for a scene whose z is up, by `Y_DOWN` for
@@ -18,6 +20,7 @@ https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussi
 from __future__ import annotations
 
 import json
+import logging
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -32,7 +35,12 @@ from recon_cli.io.calibration import rotation_matrix
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined, transformed
 from recon_cli.splats.axes import nearest_up
-from recon_cli.splats.foreign import drop_not_finite, warn_of_degree
+from recon_cli.splats.foreign import (
+    NOT_GAUSSIANS_HINT,
+    accept_surplus,
+    drop_not_finite,
+    warn_of_degree,
+)
 from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     UntrustedFile,
@@ -56,7 +64,8 @@ _UP = {"z": Z_UP, "-y": Y_DOWN, "y": Y_UP}
 _NAME = "KHR_gaussian_splatting"
 _SUPPORTED = (_NAME, "KHR_mesh_quantization")  # of the extensions that a file may require
 _COLOR_SPACE = "srgb_rec709_display"
-_FLOAT, _SHORT, _VERTICES, _POINTS = 5126, 5123, 34962, 0
+_FLOAT, _VERTICES, _POINTS = 5126, 34962, 0
+_DEFAULTS = {"kernel": "ellipse", "colorSpace": _COLOR_SPACE}
 # Distance from 1 of the nearest opacity below it in float32: a logit has to be finite.
 _LEAST_OPACITY = 2.0 ** -24
 _LEAST_SCALE = float(np.finfo(np.float32).tiny)  # a flat Gaussian has a scale of 0
@@ -69,6 +78,8 @@ _JSON_LIMIT = 1 << 22  # bytes; a scene needs a thousandth of it
 _LARGEST = (1 << 32) - 1  # bytes: the header's length has 32 bits
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+logger = logging.getLogger("recon")
 
 
 def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -> None:
@@ -89,7 +100,7 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
     colors = (SH_C0 * table["sh_dc"] + 0.5).clip(0, 1)
     columns: dict[str, NDArray[Any]] = {
         "POSITION": table["means"],
-        "COLOR_0": np.rint(np.hstack([linear_from_srgb(colors), opacities]) * 65535).astype("<u2"),
+        "COLOR_0": np.hstack([linear_from_srgb(colors), opacities]).astype(np.float32),
         f"{_NAME}:ROTATION": table["quats"][:, [1, 2, 3, 0]],
         f"{_NAME}:SCALE": scales,
         f"{_NAME}:OPACITY": opacities.astype(np.float32),
@@ -126,8 +137,6 @@ def _describe(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         accessor: dict[str, Any] = {
             "bufferView": at, "componentType": _FLOAT, "count": len(column),
             "type": _TYPES[column.shape[1]]}
-        if column.dtype == np.uint16:
-            accessor |= {"componentType": _SHORT, "normalized": True}
         if name == "POSITION":
             accessor |= {"min": column.min(axis=0).tolist(), "max": column.max(axis=0).tolist()}
         accessors.append(accessor)
@@ -136,7 +145,7 @@ def _describe(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{
             "attributes": {name: at for at, name in enumerate(columns)}, "mode": _POINTS,
-            "extensions": {_NAME: {"kernel": "ellipse", "colorSpace": _COLOR_SPACE}}}]}],
+            "extensions": {_NAME: _DEFAULTS}}]}],
         "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": start}],
     }
 
@@ -178,7 +187,9 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
                 raise container.error(f"{total} Gaussians in {container.size} bytes")
             parts.append(transformed(part, similarity))
     if not parts:
-        raise container.error(f"no Gaussians: no primitive with {_NAME}")
+        raise FormatError(
+            f"{path} holds a mesh or points, but no Gaussians (no primitive with {_NAME}).",
+            hint=NOT_GAUSSIANS_HINT)
     degree = max(part.sh_degree for part in parts)
     splats = parts[0] if len(parts) == 1 else joined(
         [part.with_degree(degree) for part in parts])[0]
@@ -211,9 +222,14 @@ def _find_primitives(
         extensions = primitive.get("extensions", {}) if isinstance(primitive, dict) else None
         if not isinstance(extensions, dict):
             raise container.error("a malformed primitive")
-        extension = extensions.get(_NAME)
+        extension, attributes = extensions.get(_NAME), primitive.get("attributes")
         if isinstance(extension, dict):
             yield primitive, extension
+        elif isinstance(attributes, dict) and f"{_NAME}:SCALE" in attributes:
+            logger.warning(
+                "%s: Gaussians without an entry of %s, which a program has left out, are read as "
+                "plain ones", container.path.name, _NAME)
+            yield primitive, _DEFAULTS
 
 
 def _read_primitive(
@@ -224,7 +240,7 @@ def _read_primitive(
         raise container.error("Gaussians that are not points")
     if extension.get("extensions"):
         raise container.error(f"Gaussians with the extensions {extension['extensions']!r:.200}")
-    for name, known in (("kernel", "ellipse"), ("colorSpace", _COLOR_SPACE)):
+    for name, known in _DEFAULTS.items():
         value = extension.get(name)
         if value != known:
             raise container.error(f"the {name} {value!r:.40}; {known} can be read")
@@ -322,8 +338,10 @@ class Container(UntrustedFile):
         _, version, length = _HEADER.unpack_from(data)
         if version != _VERSION:
             raise self.error(f"version {version} of the container; version 2 can be read")
-        if length != len(data):
+        if length > len(data):
             raise self.error(f"{len(data)} bytes where its header promises {length}")
+        accept_surplus(path, len(data) - length, _LEAST_BYTES)
+        self.data = data = data[:length]
         kind, text, at = self._chunk(data, _HEADER.size)
         if kind != _JSON or len(text) > _JSON_LIMIT:
             raise self.error(f"a first chunk {kind!r} of {len(text)} bytes, needed is JSON")

@@ -27,9 +27,16 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.splats.axes import turn_from
+from recon_cli.splats.axes import UP, turn_from
 from recon_cli.splats.format import LoadedScene, SplatFormat, Tour, WriteSettings
-from recon_cli.splats.spz import LARGEST_SCALE, POSITION_BITS, spz_bytes, spz_scene
+from recon_cli.splats.spz import (
+    FARTHEST,
+    LARGEST_SCALE,
+    POSITION_BITS,
+    SMALLEST_SCALE,
+    spz_bytes,
+    spz_scene,
+)
 from recon_cli.splats.values import read_contents
 from recon_cli.workspace.atomic import write_bytes
 
@@ -63,6 +70,8 @@ _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is
 # At five, e^-10 units, the least scale, are .0015 units of the scene: in one of COLMAP, where some
 # ten are a room, less than a millimetre.
 _MOST_HALVINGS = 5
+_FINE = 0.01  # share of the Gaussians that may be finer, by their second axis, than SPZ holds
+_LEAST_SIZE = 1e-30  # units; a size of 0 has no logarithm
 _DEFAULT_LENS = (1200, 900, 1000.0)  # width, height and focal length in pixels
 
 
@@ -182,8 +191,12 @@ def _text(name: str) -> str:
 
 _OPENED = re.compile(rb'<script id="scene" type="application/octet-stream" '
                      rb'data-format="([a-z]{1,9})" data-bytes="([0-9]{1,12})"'
-                     rb'(?: data-halvings="([0-9]{1,2})")?>')
+                     rb'(?: data-halvings="(-?[0-9]{1,2})")?>')
 _CLOSED = b"</script>"
+_NUMBER = rb"(-?[0-9]{1,9}(?:\.[0-9]{1,20})?(?:e-?[0-9]{1,2})?)"
+_UP = re.compile(rb'<script id="views" type="application/json">\{"up":\['
+                 + b",".join([_NUMBER] * 3) + rb"\]")
+_NEAR = 1e-6  # of a unit vector: rounding
 
 
 def write_html(
@@ -199,7 +212,7 @@ def write_html(
     halvings = _halvings(splats)
     # beside the scripts size hardly counts
     packed = spz_bytes(path, turn_from(_STORED, _enlarged(splats, -halvings)), harmonic_step=1,
-                       most_bits=POSITION_BITS + halvings, axes=None)
+                       least_bits=POSITION_BITS + max(0, halvings))
     tag = f' data-halvings="{halvings}"' if halvings else ""
     scene = (f'<script id="scene" type="application/octet-stream" data-format="spz" '
              f'data-bytes="{len(packed)}"{tag}>{base64.b64encode(packed).decode("ascii")}</script>')
@@ -208,11 +221,23 @@ def write_html(
 
 
 def _halvings(splats: Splats) -> int:
-    """Returns how often the scene is halved until SPZ holds its largest Gaussian."""
-    largest = float(splats.scales.detach().max()) if len(splats) else 0.0
-    if not LARGEST_SCALE < largest < math.inf:
+    """Returns how often the scene is halved until SPZ holds its largest Gaussian.
+
+    Below 0 it is doubled, until SPZ holds its fine ones, as far as the others leave room.
+    """
+    if not len(splats):
         return 0
-    return min(_MOST_HALVINGS, math.ceil(math.log2(largest / LARGEST_SCALE)))
+    scales = splats.scales.detach()
+    needed = math.log2(float(scales.max()) / LARGEST_SCALE)
+    if not math.isfinite(needed):
+        return 0
+    if needed > 0:
+        return min(_MOST_HALVINGS, math.ceil(needed))
+    fine = float(np.quantile(scales.median(dim=1).values.numpy(), _FINE))
+    farthest = float(splats.means.detach().abs().max())
+    room = min(-needed, math.log2(FARTHEST / max(farthest, fine)))
+    wanted = math.ceil(math.log2(SMALLEST_SCALE / max(fine, _LEAST_SIZE)))
+    return -max(0, min(wanted, math.floor(room)))
 
 
 def _enlarged(splats: Splats, doublings: int) -> Splats:
@@ -223,8 +248,8 @@ def _enlarged(splats: Splats, doublings: int) -> Splats:
                    log_scales=splats.log_scales + doublings * math.log(2))
 
 
-def read_html(path: Path) -> Splats:
-    """Returns the Gaussians in a page of `write_html`, or raises FormatError; no script is run."""
+def load_html(path: Path) -> LoadedScene:
+    """Returns the scene in a page of `write_html`, or raises FormatError; no script is run."""
     data = read_contents(path)
     matches = list(_OPENED.finditer(data))
     if len(matches) != 1:
@@ -246,7 +271,10 @@ def read_html(path: Path) -> Splats:
         raise FormatError(
             f"{path} promises a scene of {promised} bytes, but holds {len(packed)}: it is damaged.")
     stored = spz_scene(path, packed, axes=_STORED).splats
-    return _enlarged(stored, int(matches[0][3] or 0))
+    found = _UP.search(data)
+    up = next((name for name, axis in UP.items() if found and np.allclose(
+        axis, [float(number) for number in found.groups()], rtol=0, atol=_NEAR)), None)
+    return LoadedScene(_enlarged(stored, int(matches[0][3] or 0)), up)
 
 
 def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
@@ -272,4 +300,4 @@ def find_title(name: str) -> str:
     return words[0].upper() + words[1:]
 
 
-FORMAT = SplatFormat(lambda path: LoadedScene(read_html(path)), _write_with)
+FORMAT = SplatFormat(load_html, _write_with)

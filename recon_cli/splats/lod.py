@@ -33,7 +33,7 @@ from recon_cli.splats.sog import (
     path_escapes,
     read_files,
 )
-from recon_cli.splats.values import Floats, UntrustedFile, normalize_quats
+from recon_cli.splats.values import Floats, UntrustedFile, describe_asset, normalize_quats
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import remove
 
@@ -59,12 +59,14 @@ def make_levels(splats: Splats) -> list[Splats]:
 
 
 def write_lod(
-    path: Path, levels: Sequence[Splats], *, seed: int = 0, sharing: int = SHARING
+    path: Path, levels: Sequence[Splats], *, seed: int = 0, sharing: int = SHARING,
+    up: str | None = None,
 ) -> None:
     """Writes levels of a scene, the finest first, to `path`, a file named lod-meta.json.
 
-    The files of the levels lie beside it, and replace those of another scene. `seed` and `sharing`
-    are those of `write_sog`. FormatError if there are no Gaussians, or a value is not finite.
+    The files of the levels lie beside it, and replace those of another scene. `seed`, `sharing`
+    and `up` are those of `write_sog`. FormatError if there are no Gaussians, or a value is not
+    finite.
     """
     folder = path.parent
     folder.mkdir(parents=True, exist_ok=True)
@@ -88,7 +90,7 @@ def write_lod(
             names.append(f"{name}/{META}")
     counts = [len(splats) for splats in levels]
     write_bytes(path, _json({
-        "version": _VERSION, "asset": {"generator": "recon"}, "count": sum(counts),
+        "version": _VERSION, "asset": describe_asset(up), "count": sum(counts),
         "counts": counts, "lodLevels": len(levels), "filenames": names,
         "tree": tree.to_json()}).encode())
 
@@ -216,8 +218,8 @@ def _bound(box: NDArray[np.float64]) -> dict[str, list[float]]:
     return {"min": box[0].tolist(), "max": box[1].tolist()}
 
 
-def read_lod(path: Path) -> Splats:
-    """Returns the Gaussians of the finest level of a lod-meta.json, and those of its environment.
+def load_lod(path: Path) -> LoadedScene:
+    """Returns the finest level of a lod-meta.json, and the Gaussians of its environment.
 
     FormatError if a file is missing, damaged, or breaks its own promises.
     """
@@ -241,7 +243,14 @@ def read_lod(path: Path) -> Splats:
     if not parts:
         raise index.error("a tree without Gaussians")
     degree = max(part.sh_degree for part in parts)
-    return joined([part.with_degree(degree) for part in parts])[0]
+    return LoadedScene(
+        joined([part.with_degree(degree) for part in parts])[0], index.up(index.meta),
+        writer=index.generator(index.meta))
+
+
+def read_lod(path: Path) -> Splats:
+    """Returns the Gaussians of `load_lod`."""
+    return load_lod(path).splats
 
 
 class _Index(UntrustedFile):
@@ -251,15 +260,15 @@ class _Index(UntrustedFile):
         super().__init__(path, b"{", LOD_META)
         if len(self.data) > _META_LIMIT:
             raise self.error(f"more than {_META_LIMIT >> 20} MB")
-        self._meta = self.json_object(self.data)
+        self.meta = self.json_object(self.data)
         # files from before version 1 do not have a number
-        self.integer(self._meta, "version", _VERSION, _VERSION, default=_VERSION)
-        names = self._meta.get("filenames")
+        self.integer(self.meta, "version", _VERSION, _VERSION, default=_VERSION)
+        names = self.meta.get("filenames")
         if not isinstance(names, list) or len(names) > _FILES_LIMIT or not all(
                 isinstance(name, str) for name in names):
             raise self.error(f"filenames = {names!r:.40}; needed is a list of names")
         self.names: list[str] = names
-        environment = self._meta.get("environment")
+        environment = self.meta.get("environment")
         self.environment = None if not environment else self._path(environment)
 
     def file(self, number: int) -> Path:
@@ -273,7 +282,7 @@ class _Index(UntrustedFile):
 
     def finest(self) -> Iterator[tuple[int, int, int]]:
         """Yields (file, offset, count) of the finest level of each leaf."""
-        open_nodes = [self._meta.get("tree")]
+        open_nodes = [self.meta.get("tree")]
         while open_nodes:
             node = open_nodes.pop()
             if not isinstance(node, dict):
@@ -297,6 +306,6 @@ class _Index(UntrustedFile):
 
 
 FORMAT = SplatFormat(
-    lambda path: LoadedScene(read_lod(path)),
+    load_lod,
     lambda path, splats, settings: write_lod(
-        path, make_levels(splats.with_sphere()), sharing=settings.sharing))
+        path, make_levels(splats.with_sphere()), sharing=settings.sharing, up=settings.up_axis))

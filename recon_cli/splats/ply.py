@@ -31,9 +31,10 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
-from recon_cli.splats.axes import nearest_up
 from recon_cli.splats.foreign import (
     FLAT,
+    NOT_GAUSSIANS_HINT,
+    add_filter,
     count_terms,
     drop_not_finite,
     find_origin,
@@ -60,6 +61,10 @@ _GROUPS = {
     "log_scales": [f"scale_{i}" for i in range(3)],
     "quats": [f"rot_{i}" for i in range(4)],
 }
+_SHAPE = ("opacity", "scale_0", "rot_0")  # that any Gaussian has, and no point
+_FILTER = "filter_3D"
+# Properties of SpaceTimeGaussian, 4D-GS and others whose Gaussians move, turn or fade with time.
+_MOVING = re.compile(r"t|scale_t|rot_r_\d+|trbf_\w+|motion_\d+|omega_\d+|velocity\w*|deform\w*")
 # For an opacity of exactly 1 or 0, which splat-transform makes of 255 and 0: middle of that step.
 _MAX_LOGIT = math.log(254.75 / 0.25)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
@@ -117,9 +122,18 @@ def _header(
 
 
 def describe_scene(up: str | None, *, antialiased: bool) -> list[str]:
-    """Returns comments that tell other programs the up axis (z only) and the rasterizer."""
-    return [*(["Vertical Axis: z"] if up == "z" else []),
+    """Returns comments that tell other programs the up axis and the rasterizer.
+
+    No comment means -y, and y alone would be taken for that of Brush, see `read_up`.
+    """
+    axis = {"z": "z", "y": "+y"}.get(up or "")
+    return [*([f"Vertical Axis: {axis}"] if axis else []),
             *(["SplatRenderMode: mip"] if antialiased else [])]
+
+
+def describe_settings(settings: WriteSettings) -> list[str]:
+    """Returns the comments of `describe_scene` for a scene that is written."""
+    return describe_scene(settings.up_axis, antialiased=settings.antialiased)
 
 
 def max_gaussians(size: int, sh_degree: int, backdrop: Backdrop | None = None) -> int:
@@ -174,7 +188,7 @@ def load_ply(path: Path) -> LoadedScene:
 
 
 def read_up(header: Header) -> str | None:
-    """Returns the axis that is up by a comment `Vertical Axis`: z; None if none says so.
+    """Returns the axis that is up by a comment `Vertical Axis`; None if none says so.
 
     Brush writes y whatever is up, and -y is up in its scenes, so that y says nothing.
     """
@@ -215,6 +229,14 @@ def _read_columns(header: Header) -> dict[str, NDArray[Any]]:
     if plain:
         groups["sh_dc"] = list(_COLOR)
     missing = [name for group in groups.values() for name in group if name not in names]
+    if set(_SHAPE) <= set(missing):
+        raise FormatError(f"{path} holds a point cloud, not Gaussians: {', '.join(names)[:80]}.",
+                          hint=NOT_GAUSSIANS_HINT)
+    moving = [name for name in names if _MOVING.fullmatch(name)]
+    if moving:
+        raise FormatError(
+            f"{path} holds moving Gaussians ({', '.join(moving)[:80]}), which are not supported.",
+            hint="Export one moment as a plain .ply from the program that it came from.")
     if missing and missing != ["scale_2"]:
         raise FormatError(f"{path} lacks the properties {', '.join(missing)} of Gaussians.")
     with np.errstate(over="ignore"):  # overflow becomes infinite, which is refused
@@ -237,6 +259,8 @@ def _read_columns(header: Header) -> dict[str, NDArray[Any]]:
                                 for name in _POSITION], axis=1)
     values["logit_opacities"] = values["logit_opacities"][:, 0]
     values["sh_rest"] = by_channel.reshape(len(table), 3, terms)[:, :, :kept].transpose(0, 2, 1)
+    if _FILTER in names:
+        add_filter(path, values, table[_FILTER])
     return values
 
 
@@ -315,10 +339,11 @@ def _vertices(header: Header) -> NDArray[np.void]:
     if row is not None and "packed_position" in (row.names or ()):
         raise FormatError(
             f"{header.path} is a compressed .ply, which has another layout.",
-            hint="Convert it to a plain .ply, for example in SuperSplat.")
+            hint="Use `recon import` or `recon convert`, which read it.")
     tables = read_tables(header)
     if row is None:
-        raise FormatError(f"{header.path} holds properties of a type that Gaussians do not have.")
+        raise FormatError(f"{header.path} holds vertices with lists, which Gaussians do not have.",
+                          hint=NOT_GAUSSIANS_HINT)
     return tables["vertex"]
 
 
@@ -370,8 +395,7 @@ def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
 
 
 def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
-    up = None if settings.up is None else nearest_up(settings.up)
-    write_ply(path, splats, comments=describe_scene(up, antialiased=settings.antialiased))
+    write_ply(path, splats, comments=describe_settings(settings))
 
 
 FORMAT = SplatFormat(load_ply, _write_with)

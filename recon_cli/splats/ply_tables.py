@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.splats.foreign import NOT_GAUSSIANS_HINT, accept_surplus
 from recon_cli.workspace.paths import refuse_special
 
-_HEADER_LIMIT = 1 << 16  # bytes; a longer header is refused
+_HEADER_LIMITS = (1 << 16, 1 << 20)  # bytes; of most headers, and of those that are not refused
 _END = re.compile(rb"\nend_header[ \t]*\r?\n")
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -65,10 +66,13 @@ def read_header(path: Path) -> Header:
     refuse_special(path)
     try:
         with path.open("rb") as file:
-            head = file.read(_HEADER_LIMIT)
+            head, end, size = b"", None, os.fstat(file.fileno()).st_size
+            for limit in _HEADER_LIMITS:
+                if end is None:
+                    head += file.read(min(limit, size) - len(head))
+                    end = _END.search(head)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {error}.") from error
-    end = _END.search(head)
     if not head.startswith((b"ply\n", b"ply\r\n")) or not end:
         raise FormatError(f"{path} is not a .ply file.")
     texts = head[:end.start()].decode("ascii", "replace").splitlines()
@@ -121,15 +125,15 @@ def read_tables(header: Header) -> dict[str, NDArray[np.void]]:
         if element.count and element.row is None:
             content = "a mesh" if element.name in _OF_MESHES else "lists"
             raise FormatError(
-                f"{header.path} holds other elements than vertices: {element.count} of "
-                f"{element.name}, which is {content}, not Gaussians.")
+                f"{header.path} holds {content}, not Gaussians: {element.count} of {element.name} "
+                "besides vertices.", hint=NOT_GAUSSIANS_HINT)
     return read_elements(header, header.elements, exact=True)
 
 
 def read_elements(
     header: Header, elements: tuple[Element, ...], *, exact: bool
 ) -> dict[str, NDArray[np.void]]:
-    """Returns the rows of the first elements; `exact` demands that nothing follows."""
+    """Returns the rows of the first elements; `exact` demands that no further row follows."""
     rows = [(each.name, each.count, each.row) for each in elements if each.row is not None]
     is_text = header.format == "ascii"
     try:
@@ -139,11 +143,15 @@ def read_elements(
                 fits = sum(2 * count * len(row.names or ()) for _, count, row in rows) <= size + 1
             else:
                 promised = sum(count * row.itemsize for _, count, row in rows)
-                fits = promised == size if exact else promised <= size
+                # a row or a property that the header lacks takes at least as much
+                least = max((min(row.itemsize, count) for _, count, row in rows), default=1)
+                fits = promised <= size and not (exact and size >= promised + least)
             if not fits:
                 listed = ", ".join(
                     f"{count} of {name} of {row.itemsize} bytes" for name, count, row in rows)
                 raise _wrong_size(header, listed, f"{size} bytes of data")
+            if exact and not is_text:
+                accept_surplus(header.path, size - promised)
             file.seek(header.offset)
             data = file.read(size if is_text else promised)
     except OSError as error:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
+from recon_cli.splats.axes import read_up_comment, up_comment
 from recon_cli.splats.foreign import FLAT, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.merge_tree import MergeTree, build_tree
@@ -52,7 +53,7 @@ def load_rad(path: Path) -> LoadedScene:
     columns = drop_not_finite(path, file.columns())
     alphas = np.clip(columns["alpha"][:, 0].astype(np.float64), _LEAST, 1 - _LEAST)
     count = len(alphas)
-    comment = file.meta.get("comment")
+    comment = str(file.meta.get("comment") or "")
     return LoadedScene(splats_from_arrays(path, {
         "means": columns["center"], "quats": columns["orientation"],
         "log_scales": columns["scales"], "logit_opacities": np.log(alphas / (1 - alphas)),
@@ -61,7 +62,7 @@ def load_rad(path: Path) -> LoadedScene:
             np.zeros((count, 0), np.float32),
             *(columns[f"sh{degree}"] for degree in range(1, file.degree + 1))],
             axis=1).reshape(count, TERMS[file.degree], 3)}),
-        writer=comment if isinstance(comment, str) else "")
+        read_up_comment(comment), writer=comment)
 
 
 class _RadFile(UntrustedFile):
@@ -230,8 +231,11 @@ _ENCODINGS: dict[str, Callable[[Array, int, float, float], Array]] = {
     "u32": lambda data, k, *_: _columns(data.view("<u4"), k),
 }
 
-def write_rad(path: Path, splats: Splats) -> None:
+
+def write_rad(path: Path, splats: Splats, *, up: str | None = None) -> None:
     """Writes a scene, and a tree of levels over it, of which Spark loads what it shows.
+
+    `up` is the axis that is up, z, -y or y, as a comment; None leaves it out.
 
     FormatError if there are no Gaussians, a value is not finite, or a colour is above 65504.
     """
@@ -252,7 +256,7 @@ def write_rad(path: Path, splats: Splats) -> None:
         "splatEncoding": {
             "rgbMin": min(0.0, float(rgb.min())), "rgbMax": max(1.0, float(rgb.max())),
             "lodOpacity": True},
-        "comment": "recon"}
+        "comment": up_comment(up)}
     write_bytes(path, b"".join([_pack_json(_MAGIC, meta), *chunks]))
 
 
@@ -313,4 +317,5 @@ def _pack_json(magic: bytes, meta: Mapping[str, Any]) -> bytes:
 
 
 FORMAT = SplatFormat(
-    load_rad, lambda path, splats, _: write_rad(path, splats.with_sphere()))
+    load_rad, lambda path, splats, settings: write_rad(
+        path, splats.with_sphere(), up=settings.up_axis))

@@ -13,18 +13,26 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
+from recon_cli.splats.values import read_start
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, READABLE, ExportFormat
 
 logger = logging.getLogger("recon")
 
 FORMATS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
+_START = 1 << 20  # bytes of a file that its format is found in
 _READERS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in READABLE}
 
 
 def format_of(path: Path) -> ExportFormat:
-    """Returns the row of a file by the end of its name; FormatError if there is no such row."""
+    """Returns the row of a file by its first bytes, or else by its name; FormatError if unknown."""
+    start = read_start(path, _START) if path.is_file() else b""
+    found = [row for row in READABLE if row.signature and row.signature.match(start)]
+    return found[0] if found else _format_by_name(path)
+
+
+def _format_by_name(path: Path) -> ExportFormat:
     found = [row for row in READABLE if row.fits_name(path.name)]
     if not found:
         raise FormatError(
@@ -36,7 +44,7 @@ def format_of(path: Path) -> ExportFormat:
 
 def check_writable(path: Path) -> ExportFormat:
     """Returns the row of a file to write by its name; FormatError or InputError if it cannot be."""
-    row = format_of(path)
+    row = _format_by_name(path)
     if row.name not in FORMATS:
         raise FormatError(
             f"{path} cannot be written: .{row.name} is only read.",
@@ -82,7 +90,7 @@ def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:
         return _turn((form.load_unturned or form.load)(path), axes)
     except FormatError as error:
         error.hint = error.hint or (
-            f"Copy or export it again; if it is not a .{row.name}, rename it to its real format.")
+            f"Copy or export it again, if it is a .{row.name}.")
         raise
 
 

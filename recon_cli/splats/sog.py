@@ -38,9 +38,11 @@ from recon_cli.splats.values import (
     Floats,
     UntrustedFile,
     decode_smallest_three,
+    describe_asset,
     encode_smallest_three,
     logit,
     morton_codes,
+    read_start,
     sigmoid,
     splats_from_arrays,
     to_arrays,
@@ -67,16 +69,17 @@ Doubles = NDArray[np.float64]
 
 def write_sog(
     path: Path, splats: Splats, *, seed: int = 0, sharing: int = SHARING,
-    antialiased: bool = False,
+    antialiased: bool = False, up: str | None = None,
 ) -> None:
     """Writes `splats` to `path`, whole or not at all; the same seed gives the same bytes.
 
     Gaussians are sorted in Morton order, those that have coefficients first. Quaternions are
     normalized, and opacities are rounded to 255ths. `seed` is of the k-means that finds codebooks
     and palette, in which an entry stands for the harmonics of `sharing` Gaussians. FormatError if
-    there are no Gaussians, or a value is not finite.
+    there are no Gaussians, or a value is not finite. `up` is z, -y or y; None leaves it out.
     """
     meta, images = pack_splats(splats, seed=seed, sharing=sharing)
+    meta["asset"] = describe_asset(up)
     if antialiased:
         meta |= {"antialias": True, "model": "antialiased"}
     write_bytes(path, pack_archive(meta, images))
@@ -110,7 +113,7 @@ def pack_splats(
         "sh0.webp": np.column_stack([nearest_entries(table["sh_dc"], sh0), opacities]),
     }
     meta: dict[str, Any] = {
-        "version": 2, "asset": {"generator": "recon"}, "count": len(splats), "antialias": False,
+        "version": 2, "asset": describe_asset(None), "count": len(splats), "antialias": False,
         "means": {"mins": low.tolist(), "maxs": high.tolist(),
                   "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": _json(scales), "files": ["scales.webp"]},
@@ -139,16 +142,16 @@ def _json(book: Floats) -> list[float]:
 
 
 def load_sog(path: Path) -> LoadedScene:
-    """Returns the scene of a .sog in the file's order, and whether antialiasing was trained.
+    """Returns the scene of a .sog, or of its unpacked meta.json, in the file's order.
 
     Gaussians behind the last one that has a coefficient other than zero are of degree 0.
     FormatError if the file is missing, damaged, of version 1, or breaks its own promises.
     """
-    archive = Archive(path)
+    archive = Unpacked(path) if read_start(path, 1) == b"{" else Archive(path)
     meta = archive.meta()
     antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
     return LoadedScene(
-        read_files(archive), antialiased=antialiased, writer=archive.generator(meta))
+        read_files(archive), archive.up(meta), antialiased, writer=archive.generator(meta))
 
 
 def read_files(archive: SogFiles) -> Splats:
@@ -426,4 +429,5 @@ def path_escapes(name: str) -> bool:
 
 FORMAT = SplatFormat(
     load_sog, lambda path, splats, settings: write_sog(
-        path, splats.with_sphere(), sharing=settings.sharing, antialiased=settings.antialiased))
+        path, splats.with_sphere(), sharing=settings.sharing, antialiased=settings.antialiased,
+        up=settings.up_axis))

@@ -6,18 +6,20 @@ quaternion (bytes of x, y and z in version 2), harmonics bytes of 1/128.
 
 The extension 0xADBE0003 says which axes a file has. Without it the documentation says RUB, but the
 programs that are used write and read the axes of the .ply they convert, which is RDF: docs/formats.
+It is written in version 4 alone, since readers of the older ones refuse or misread such a file. In
+versions 2 and 3 a comment in the header of gzip, which every program skips, says which axis is up.
 
-Versions 2 and 3 are one gzip stream (or the same bytes plain): a header of 16 bytes, then
+Versions 1 to 3 are one gzip stream (or the same bytes plain): a header of 16 bytes, then
 positions, opacities, colours, scales, rotations and harmonics. Version 4 has an uncompressed header
-of 32 bytes and table of sizes, and one zstd stream for each array that is not empty. Version 1 was
-never released and is not supported. Never more is unpacked than the header's count implies.
+of 32 bytes and table of sizes, and one zstd stream for each array that is not empty. Version 1,
+whose positions are float16, is only read. Never more is unpacked than the header's count implies.
 """
 
 from __future__ import annotations
 
-import gzip
 import logging
 import math
+import re
 import struct
 import zlib
 from dataclasses import dataclass, replace
@@ -30,8 +32,16 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import TERMS, Splats
-from recon_cli.splats.axes import AXES, PLY, Z_UP, nearest_up, turn_from, up_of
-from recon_cli.splats.foreign import warn_of_degree
+from recon_cli.splats.axes import (
+    AXES,
+    PLY,
+    Z_UP,
+    read_up_comment,
+    turn_from,
+    up_comment,
+    up_of,
+)
+from recon_cli.splats.foreign import accept_surplus, warn_of_degree
 from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     Bytes,
@@ -49,12 +59,16 @@ from recon_cli.workspace.atomic import write_bytes
 
 logger = logging.getLogger("recon")
 
-_FRACTIONAL_BITS = (8, 12)  # fewest and most that are written; 12 is Niantic's
-POSITION_BITS = _FRACTIONAL_BITS[1]
+_FEWEST_BITS, POSITION_BITS = 8, 12  # fractional bits of a position: fewest, and Niantic's
 _MOST = (1 << 23) - 1  # of a position, in fractions
+# Of the median Gaussian's size, by which a position is rounded. In a close-up of 0.2 mm Gaussians
+# 1/10 loses .34 dB, 1/20 .16 and 1/40 .11; each halving takes 2% more bytes.
+_ROUNDING = 1 / 32
 _SCALE_STEPS, _SCALE_OFFSET = 16, 10  # byte = (log scale + 10) * 16
 _LARGEST_SCALE = 255 / _SCALE_STEPS - _SCALE_OFFSET
-LARGEST_SCALE = math.exp(_LARGEST_SCALE)  # that an SPZ file holds, in units of the scene
+# That an SPZ file holds, in units of the scene: sizes of Gaussians, and a coordinate.
+LARGEST_SCALE, SMALLEST_SCALE = math.exp(_LARGEST_SCALE), math.exp(-_SCALE_OFFSET)
+FARTHEST = _MOST / 2.0**_FEWEST_BITS
 _COLOR = 0.15  # byte = (0.15 * dc + 0.5) * 255, so that dc of -3.33 to 3.33 fit
 _HARMONIC = 128
 # In steps of 2 of the 256 a trained scene of degree 3 packs to 1/8.2 of its .ply instead of 1/7.0
@@ -62,7 +76,8 @@ _HARMONIC = 128
 _HARMONIC_STEP = 2
 _MAGNITUDE = 511  # of a component of a rotation; 9 bits and a sign
 _WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
-VERSIONS = (2, 3, 4)
+VERSIONS = (2, 3, 4)  # that are written
+_HALVES = 1  # the version whose positions are float16
 _MAGIC = b"NGSP"
 _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits, flags, streams
 _MORE = struct.Struct("<I12x")  # of version 4: where the table of sizes begins
@@ -72,40 +87,41 @@ _HAS_EXTENSIONS = 2
 _EXTENSIONS_LIMIT = 1 << 20  # bytes
 _ADOBE, _ORBIT_CAMERA, _AXES = 0xADBE, 0xADBE0002, 0xADBE0003
 _AXES_RECORD = struct.Struct("<III")  # type, 4, and a number of AXES from 1; 0 means none
-# The axes that are written, by up. Without a name all programs show a file as it is, with y up.
-_AXES_BY_UP = {"z": Z_UP, "-y": PLY, "y": None}
+_AXES_BY_UP = {"z": Z_UP, "-y": PLY, "y": "rub"}  # names in version 4 of axes as they are, by up
+# A header of gzip that has no time and no system; a comment up to a 0 follows and nothing else.
+_GZIP_HEADER = b"\x1f\x8b\x08\x10\0\0\0\0\0\xff"
+_COMMENT = re.compile(re.escape(_GZIP_HEADER) + rb"([ -~]{,40})\0")
 _ANTIALIASED = 1
 # Coefficients a channel that a file may have; those above degree 3 are cut off.
 _FILE_TERMS = (*TERMS, 24)
 _MAX_FRACTIONAL_BITS = 24
 # Limits of the unpacked size. A scene whose harmonics are all 0 reaches 5 times its size.
 _HARMLESS_BYTES, _MAX_RATIO = 1 << 24, 128
-_ZSTD_LEVEL = 12  # that of Niantic's program
+_GZIP_LEVEL, _ZSTD_LEVEL = 6, 12  # those of Niantic's program
 
 
 def write_spz(
-    path: Path, splats: Splats, *, version: int = 3, axes: str | None = PLY,
+    path: Path, splats: Splats, *, version: int = 3, up: str | None = None,
     antialiased: bool = False,
 ) -> None:
     """Writes `splats` to `path`, whole or not at all; see `spz_bytes`."""
-    write_bytes(path, spz_bytes(
-        path, splats, version=version, axes=axes, antialiased=antialiased))
+    write_bytes(path, spz_bytes(path, splats, version=version, up=up, antialiased=antialiased))
 
 
 def spz_bytes(
     path: Path, splats: Splats, *, version: int = 3, harmonic_step: int = _HARMONIC_STEP,
-    most_bits: int = _FRACTIONAL_BITS[1], axes: str | None = PLY, antialiased: bool = False,
+    least_bits: int = POSITION_BITS, up: str | None = None, antialiased: bool = False,
 ) -> bytes:
     """Returns the bytes of an SPZ file of `splats`, whose values are written as they are.
 
-    `axes` is the name of their axes in AXES, which the file records; None leaves it out.
+    `up` is the axis that is up, z, -y or y, which the file records; None leaves it out.
 
     Log scales below -10 become -10, and above 5.9375, with a warning, 5.9375; coefficients outside
-    -1 to 127/128 and dc outside -3.33 to 3.33 are clipped. Positions get `most_bits` fractional
-    bits, 12 in Niantic's program, fewer where they do not fit, and never fewer than 8.
-    `version` is 3, which all current readers support, 2, with coarser rotations, or 4.
-    `harmonic_step` is in 1/128; 1 is the finest. `path` is for messages. FormatError if there are
-    no Gaussians, one is too far away, or a parameter is not finite.
+    -1 to 127/128 and dc outside -3.33 to 3.33 are clipped. Positions get `least_bits` fractional
+    bits, 12 in Niantic's program, more where these move a Gaussian visibly, and fewer, down to 8,
+    where they do not fit. `version` is 3, which most readers support, 2, with coarser rotations,
+    or 4. `harmonic_step` is in 1/128; 1 is the finest. `path` is for messages. FormatError if there
+    are no Gaussians, one is too far away, or a parameter is not finite.
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is not one of {VERSIONS}")
@@ -118,8 +134,14 @@ def spz_bytes(
         logger.warning(
             "%s: %s Gaussians are made smaller: SPZ holds e^%g units, the largest has e^%.1f",
             path.name, f"{large:,}", _LARGEST_SCALE, log_scales.max())
-    bits = _fractional_bits(path, means, most_bits)
-    header = SpzHeader(version, len(splats), values.sh_degree, bits, axes, antialiased)
+    # the two larger axes of a Gaussian are what is seen of it
+    fine = int((np.median(log_scales, axis=1) < -_SCALE_OFFSET).sum())
+    if fine:
+        logger.warning("%s: %s Gaussians are made larger: SPZ holds e^%d units and more",
+                       path.name, f"{fine:,}", -_SCALE_OFFSET)
+    bits = _fractional_bits(path, means, max(least_bits, _useful_bits(log_scales)))
+    axes = None if up is None else _AXES_BY_UP[up]
+    header = SpzHeader(version, len(splats), values.sh_degree, bits, axes, up, antialiased)
     return pack(header, [
         _position_bytes(means, bits),
         encode_opacities(values.logit_opacities.numpy()),
@@ -132,9 +154,9 @@ def spz_bytes(
 
 
 def load_spz(path: Path, *, axes: str | None = None) -> LoadedScene:
-    """Returns the scene of an SPZ file of version 2, 3 or 4, in the file's order and degree.
+    """Returns the scene of an SPZ file of version 1 to 4, in the file's order and degree.
 
-    It is turned from `axes`, or from those that the file records, as `axes.turn_from` does;
+    It is turned from `axes`, or from those that the file names, as `axes.turn_from` does;
     without either it stays. Harmonics of degree 4 are cut, with a warning. FormatError if the file
     is missing, damaged, or of another format or version.
     """
@@ -148,7 +170,8 @@ def spz_scene(path: Path, data: bytes, *, axes: str | None = None) -> LoadedScen
     warn_of_degree(path, header.sh_degree)
     coefficients = harmonics.reshape(n, _FILE_TERMS[header.sh_degree], 3)[:, :kept]
     splats = splats_from_arrays(path, {
-        "means": _positions(places, header.fractional_bits),
+        "means": _halves(places) if header.version == _HALVES else _positions(
+            places, header.fractional_bits),
         "quats": _rotations(rotations.reshape(n, -1)),
         "log_scales": scales.astype(np.float32).reshape(n, 3) / _SCALE_STEPS - _SCALE_OFFSET,
         "logit_opacities": decode_opacities(opacities),
@@ -157,20 +180,26 @@ def spz_scene(path: Path, data: bytes, *, axes: str | None = None) -> LoadedScen
     })
     axes = axes or header.axes
     if axes is None:
-        return LoadedScene(splats, antialiased=header.antialiased)
+        return LoadedScene(splats, header.up, header.antialiased)
     return LoadedScene(turn_from(axes, splats), up_of(axes), header.antialiased)
+
+
+def _useful_bits(log_scales: Floats) -> int:
+    """Returns the fewest fractional bits that round the median Gaussian by `_ROUNDING` at most."""
+    size = float(np.median(log_scales)) / math.log(2)
+    return math.ceil(-size - 1 - math.log2(_ROUNDING))
 
 
 def _fractional_bits(path: Path, means: Floats, most: int) -> int:
     """Returns the most fractional bits, at most `most`, with which every position fits."""
     farthest = float(np.abs(means).max())
-    fewest, _ = _FRACTIONAL_BITS
-    for bits in range(most, fewest - 1, -1):
+    for bits in range(min(most, _MAX_FRACTIONAL_BITS), _FEWEST_BITS - 1, -1):
         if np.rint(farthest * 2.0**bits) <= _MOST:
             return bits
     raise FormatError(
         f"A Gaussian lies {farthest:g} units from the origin, too far for {path}: up to "
-        f"{_MOST / 2.0**fewest:.0f} fit.", hint="Remove it, scale the scene down, or write a .ply.")
+        f"{FARTHEST:.0f} fit.",
+        hint="Remove it, scale the scene down, or write a .ply.")
 
 
 def _position_bytes(means: Floats, bits: int) -> Bytes:
@@ -183,6 +212,10 @@ def _positions(data: Bytes, bits: int) -> Floats:
     wide[:, :, 1:] = data.reshape(-1, 3, 3)
     fixed = wide.view("<i4")[:, :, 0] >> 8  # the shift carries the sign down
     return (fixed / 2.0**bits).astype(np.float32)
+
+
+def _halves(data: Bytes) -> Floats:
+    return data.view("<f2").astype(np.float32).reshape(-1, 3)
 
 
 def _rotation_bytes(quats: Floats) -> Bytes:
@@ -200,7 +233,7 @@ def _vector_bytes(quats: Floats) -> Bytes:
 
 
 def _rotations(data: Bytes) -> Floats:
-    """Returns quaternions wxyz from [N, 4] bytes, or from the [N, 3] of version 2."""
+    """Returns quaternions wxyz from [N, 4] bytes, or from the [N, 3] of versions 1 and 2."""
     if data.shape[1] == 3:
         vector = data.astype(np.float32) / 127.5 - 1
         real = np.sqrt(np.maximum(0, 1 - (vector * vector).sum(axis=1, keepdims=True)))
@@ -217,35 +250,52 @@ def _rotations(data: Bytes) -> Floats:
 class SpzHeader:
     """Version, count, degree, precision and axes of the arrays."""
 
-    version: int  # 2, 3 or 4
+    version: int  # 1 to 4
     count: int  # Gaussians, N
     sh_degree: int  # 0 to 4
     fractional_bits: int  # of the positions
     axes: str | None = None  # a name in AXES; None where the file does not say
+    up: str | None = None  # the axis that is up, by a comment of our own
     antialiased: bool = False
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
-        each = (9, 1, 3, 3, 3 if self.version < 3 else 4, 3 * _FILE_TERMS[self.sh_degree])
+        each = (6 if self.version == _HALVES else 9, 1, 3, 3, 3 if self.version < 3 else 4,
+                3 * _FILE_TERMS[self.sh_degree])
         return tuple(self.count * size for size in each)
+
+    @property
+    def gaussian_bytes(self) -> int:
+        """Bytes of a Gaussian."""
+        return sum(self.sizes) // self.count
 
 
 def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
     """Returns the file of the six arrays, each of the header's size."""
     raw = [array.tobytes() for array in arrays]
     assert tuple(len(item) for item in raw) == header.sizes
+    flags = _ANTIALIASED if header.antialiased else 0
+    fields = (_MAGIC, header.version, header.count, header.sh_degree, header.fractional_bits)
+    if header.version < 4:
+        return _gzip(_HEAD.pack(*fields, flags, 0) + b"".join(raw), header.up)
     record = b"" if header.axes is None else _AXES_RECORD.pack(
         _AXES, 4, 1 + AXES.index(header.axes))
-    flags = (_ANTIALIASED if header.antialiased else 0) | (_HAS_EXTENSIONS if record else 0)
-    fields = (_MAGIC, header.version, header.count, header.sh_degree, header.fractional_bits, flags)
-    if header.version < 4:
-        return gzip.compress(_HEAD.pack(*fields, 0) + b"".join(raw) + record, 6, mtime=0)
+    flags |= _HAS_EXTENSIONS if record else 0
     raw = [item for item in raw if item]
     packed = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(item) for item in raw]
     sizes = [_SIZES.pack(len(small), len(large)) for small, large in zip(packed, raw, strict=True)]
     table = _HEAD.size + _MORE.size + len(record)
-    return b"".join([_HEAD.pack(*fields, len(raw)), _MORE.pack(table), record, *sizes, *packed])
+    head = _HEAD.pack(*fields, flags, len(raw)) + _MORE.pack(table)
+    return b"".join([head, record, *sizes, *packed])
+
+
+def _gzip(data: bytes, up: str | None) -> bytes:
+    """Returns a stream of gzip whose header says which axis is up; the same bytes at any time."""
+    packer = zlib.compressobj(_GZIP_LEVEL, wbits=-zlib.MAX_WBITS)
+    comment = up_comment(up).encode("ascii")
+    return b"".join([_GZIP_HEADER, comment, b"\0", packer.compress(data), packer.flush(),
+                     struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)])
 
 
 def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
@@ -266,7 +316,9 @@ def unpack(path: Path, data: bytes) -> tuple[SpzHeader, list[Bytes]]:
             raise FormatError(f"{path} is not an SPZ file.")
     except (zlib.error, zstandard.ZstdError) as error:
         raise FormatError(f"{path} cannot be unpacked: {error}.") from error
-    header = replace(header, axes=_read_extensions(path, extensions))
+    comment = _COMMENT.match(data)
+    header = replace(header, axes=_read_extensions(path, extensions),
+                     up=read_up_comment(comment[1].decode("ascii")) if comment else None)
     ends = np.cumsum(header.sizes)[:-1]
     return header, np.split(np.frombuffer(body, np.uint8), ends)
 
@@ -278,8 +330,8 @@ def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
     magic, version, count, degree, bits, flags, streams = _HEAD.unpack(head)
     if magic != _MAGIC:
         raise FormatError(f"{path} is not an SPZ file.")
-    if version not in VERSIONS:
-        raise FormatError(f"{path} is of SPZ version {version}; 2, 3 and 4 can be read.")
+    if version not in (_HALVES, *VERSIONS):
+        raise FormatError(f"{path} is of SPZ version {version}; 1 to 4 can be read.")
     if degree >= len(_FILE_TERMS):
         raise FormatError(f"{path} has harmonics of degree {degree}; at most 4 can be read.")
     if bits > _MAX_FRACTIONAL_BITS:
@@ -299,12 +351,13 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[SpzHeader, bytes, bytes]:
     header, flags, _ = _parse(path, head, len(data))
     if header.version == 4:
         raise FormatError(f"{path} is of version 4 but packed as older ones are: it is damaged.")
-    limit = sum(header.sizes) + (_EXTENSIONS_LIMIT if flags & _HAS_EXTENSIONS else 0)
-    body = stream.decompress(stream.unconsumed_tail, limit)
-    if stream.decompress(stream.unconsumed_tail, 1) or stream.unused_data:
+    more = _EXTENSIONS_LIMIT if flags & _HAS_EXTENSIONS else header.gaussian_bytes
+    body = stream.decompress(stream.unconsumed_tail, sum(header.sizes) + more)
+    if not stream.eof and stream.decompress(stream.unconsumed_tail, 1):
         raise _too_long_error(path)
     if not stream.eof:
         raise _truncated_error(path)
+    accept_surplus(path, len(stream.unused_data))  # which is not unpacked
     return header, *_split_extensions(path, body, header, flags)
 
 
@@ -315,9 +368,10 @@ def _split_extensions(
     size = sum(header.sizes)
     if len(body) < size:
         raise _truncated_error(path)
-    if len(body) > size and not flags & _HAS_EXTENSIONS:
-        raise _too_long_error(path)
-    return body[:size], body[size:]
+    if flags & _HAS_EXTENSIONS:
+        return body[:size], body[size:]
+    accept_surplus(path, len(body) - size, header.gaussian_bytes)
+    return body[:size], b""
 
 
 def _unpack_streams(
@@ -344,8 +398,9 @@ def _unpack_streams(
             stream, max_output_size=size, allow_extra_data=False))
         if len(parts[-1]) != size:
             raise _truncated_error(path)
-    if start != len(data):
-        raise _too_long_error(path) if start < len(data) else _truncated_error(path)
+    if start > len(data):
+        raise _truncated_error(path)
+    accept_surplus(path, len(data) - start, header.gaussian_bytes)
     return b"".join(parts), extensions
 
 
@@ -393,8 +448,7 @@ def _too_long_error(path: Path) -> FormatError:
 def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
     write_spz(
         path, splats.with_sphere(LARGEST_SCALE), version=settings.options.get("spz_version", 3),
-        axes=PLY if settings.up is None else _AXES_BY_UP[nearest_up(settings.up)],
-        antialiased=settings.antialiased)
+        up=settings.up_axis, antialiased=settings.antialiased)
 
 
 FORMAT = SplatFormat(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import Splats, with_rows
+from recon_cli.splats.axes import UP
 
 _FAR = 10.0  # times the median distance of all from their middle
 _SHELL = 1.5  # outer distance over the inner one
@@ -71,6 +72,20 @@ def read_contents(path: Path) -> bytes:
         raise FormatError(f"{path} cannot be read: {error}.") from error
 
 
+def describe_asset(up: str | None) -> dict[str, Any]:
+    """Returns `asset` of a JSON: the program, and the axis that is up, z, -y or y, if known."""
+    return {"generator": "recon", **({} if up is None else {"extras": {"up": up}})}
+
+
+def read_start(path: Path, count: int) -> bytes:
+    """Returns the first bytes of a file; none if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError:
+        return b""
+
+
 class UntrustedFile:
     """The bytes of a file and checks of the JSON in it, each of which raises FormatError."""
 
@@ -106,6 +121,13 @@ class UntrustedFile:
         asset = json.get("asset")
         name = asset.get("generator") if isinstance(asset, dict) else None
         return name if isinstance(name, str) else ""
+
+    def up(self, json: Mapping[str, Any]) -> str | None:
+        """Returns the axis that is up by `asset.extras`: z, -y or y; None if it does not say."""
+        asset = json.get("asset")
+        extras = asset.get("extras") if isinstance(asset, dict) else None
+        axis = extras.get("up") if isinstance(extras, dict) else None
+        return axis if isinstance(axis, str) and axis in UP else None
 
     def integer(
         self, part: Mapping[str, Any], name: str, least: int, most: int,

@@ -8,6 +8,7 @@ meshes and plans are written by `export.format_writer`.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Literal
@@ -20,6 +21,10 @@ _SURFACE_OPTIONS = (*_MESH_OPTIONS, "inferred")
 _TEXTURE_OPTIONS = (*_SURFACE_OPTIONS, "texture", "texture_format")
 # Gaussians per entry of the palette of colours, on the mean: the smallest file first
 _SHARING = (16, 8, 4, 2, 1)
+
+
+def _starts(pattern: bytes) -> re.Pattern[bytes]:
+    return re.compile(pattern, re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,9 @@ class ExportFormat:
     sh_degree: int = 3  # the highest that it holds; a scene of a higher one is fitted to it
     # values of `WriteSettings.sharing`, one after the other, until the loss is small enough
     sharing: tuple[int, ...] = (1,)
+    # pattern of the first bytes of its files, by which they are known whatever their name; None
+    # where a file has nothing to know it by
+    signature: re.Pattern[bytes] | None = None
 
     @property
     def patterns(self) -> tuple[str, ...]:
@@ -61,21 +69,26 @@ class ExportFormat:
 
 EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("ply", "gaussians", "splats.ply", "recon_cli.splats.ply", more_files=(
-        "transform.json",)),
+        "transform.json",), signature=_starts(rb"ply\r?\n(?!.*\bpacked_position\b)")),
     ExportFormat("compressed.ply", "gaussians", "splats.compressed.ply",
-                 "recon_cli.splats.compressed_ply"),
+                 "recon_cli.splats.compressed_ply",
+                 signature=_starts(rb"ply\r?\n.*\bpacked_position\b")),
     ExportFormat("splat", "gaussians", "splats.splat", "recon_cli.splats.splat", max_loss_db=3.0,
                  sh_degree=0),
     ExportFormat("spz", "gaussians", "splats.spz", "recon_cli.splats.spz", options=(
-        "spz_version",)),
+        "spz_version",), signature=_starts(rb"\x1f\x8b|NGSP")),
     ExportFormat("sog", "gaussians", "splats.sog", "recon_cli.splats.sog", options=("max_loss",),
-                 sharing=_SHARING),
-    ExportFormat("glb", "gaussians", "splats.glb", "recon_cli.splats.glb"),
+                 sharing=_SHARING, signature=_starts(rb'PK\x03\x04|\s*\{.*"means"')),
+    ExportFormat("glb", "gaussians", "splats.glb", "recon_cli.splats.glb",
+                 signature=_starts(b"glTF")),
     ExportFormat("html", "gaussians", "splats.html", "recon_cli.splats.html", more_files=(
-        "splats.jpg",), options=("title", "credits")),
+        "splats.jpg",), options=("title", "credits"),
+                 signature=_starts(rb"\s*(?i:<!doctype html|<html)")),
     ExportFormat("lod", "gaussians", "lod/lod-meta.json", "recon_cli.splats.lod", more_files=(
-        "lod/*",), options=("max_loss",), sharing=_SHARING),
-    ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad"),
+        "lod/*",), options=("max_loss",), sharing=_SHARING,
+                 signature=_starts(rb'\s*\{.*"lodLevels"')),
+    ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad",
+                 signature=_starts(b"RAD0")),
     ExportFormat("points.ply", "points", "points.ply"),
     ExportFormat("colmap", "cameras", "sparse/0", index="images.bin", more_files=(
         "sparse/*", "images/*", "database.db", "colmap/*")),  # colmap/: before version 5

@@ -57,13 +57,16 @@ def test_a_glb_holds_linear_colours_that_no_light_changes(tmp_path):
     gltf = json.loads(data[20:20 + length])
     primitive = gltf["meshes"][0]["primitives"][0]
     accessor = gltf["accessors"][primitive["attributes"]["COLOR_0"]]
-    assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (
-        5123, "VEC4", True)
+    assert (accessor["componentType"], accessor["type"]) == (5126, "VEC4")
     start = gltf["bufferViews"][accessor["bufferView"]]["byteOffset"]
-    stored = np.frombuffer(data, "<u2", 4 * 256, 28 + length + start).reshape(-1, 4) / 65535
+    stored = np.frombuffer(data, "<f4", 4 * 256, 28 + length + start).reshape(-1, 4)
     share = codes / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    assert np.abs(stored[:, :3] - linear).max() <= 0.5 / 65535 + 1e-9
+    assert np.abs(stored[:, :3] - linear).max() <= 1e-7
+    # as a second reader has them
+    [read] = trimesh.load(tmp_path / "mesh.glb", process=False).geometry.values()
+    read = read.visual.vertex_attributes["color"]
+    assert np.abs(read[:, :3] - linear).max() <= 1e-7
     assert (stored[:, 3] == 1).all()
     material = gltf["materials"][primitive["material"]]
     assert material["extensions"] == {"KHR_materials_unlit": {}}

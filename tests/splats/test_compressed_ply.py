@@ -156,7 +156,7 @@ def test_what_does_not_fit_is_refused_and_tiny_scales_are_clamped(tmp_path):
 @pytest.mark.parametrize(("change", "message"), [
     (lambda _: b"", "not a .ply"),
     (lambda data: data[:-1], "truncated"),
-    (lambda data: data + b"1", "truncated or damaged"),
+    (lambda data: data + bytes(9), "truncated or damaged"),
     (lambda data: data.replace(b"vertex 9", b"vertex 9000000000"), "truncated"),
     (lambda data: data.replace(b"chunk 1", b"chunk 2").replace(b"end_header\n", (
         b"end_header\n" + bytes(72))), "2 chunks of 256 for 9"),

@@ -104,8 +104,8 @@ def test_the_attributes_are_what_the_extension_says(tmp_path):
     # sRGB into linear light, as glTF has colours of vertices (IEC 61966-2-1)
     linear = torch.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     wanted = torch.cat([linear, splats.opacities[:, None]], dim=1)
-    assert colors.dtype == np.uint16
-    np.testing.assert_allclose(colors / 65535, wanted, atol=0.5 / 65535 + 1e-6)
+    assert colors.dtype == np.float32  # of 16 bits trimesh and MeshLab read the lower 8
+    np.testing.assert_allclose(colors, wanted, atol=1e-6)
 
 
 def test_the_container_is_what_its_format_says(tmp_path):
@@ -220,10 +220,34 @@ def test_scenes_that_no_file_can_hold_are_refused(tmp_path):
 
 def test_a_file_without_gaussians_is_refused(tmp_path):
     write_glb(tmp_path / "a.glb", archive_splats.room(5))
-    changed(tmp_path / "a.glb", lambda value: value["meshes"][0]["primitives"][0].pop(
-        "extensions"))
-    with pytest.raises(FormatError, match="no Gaussians"):
+    changed(tmp_path / "a.glb", lambda value: value["meshes"][0]["primitives"][0].update(
+        extensions={}, attributes={"POSITION": 0}))
+    with pytest.raises(FormatError, match="no Gaussians") as caught:
         load_glb(tmp_path / "a.glb")
+    assert "again" not in caught.value.hint
+
+
+def test_gaussians_whose_entry_a_program_left_out_are_read_with_a_warning(tmp_path, caplog):
+    """gltf-transform and others drop extensions that they do not know, and keep attributes."""
+    path, splats = tmp_path / "a.glb", archive_splats.room(40)
+    write_glb(path, splats)
+    wanted = load_glb(path)
+    changed(path, lambda value: (value["meshes"][0]["primitives"][0].pop("extensions"),
+                                 value.pop("extensionsUsed")))
+    back = load_glb(path)
+    for name, value in wanted.splats.parameters().items():
+        assert torch.equal(getattr(back.splats, name), value), name
+    assert back.up == wanted.up
+    assert "KHR_gaussian_splatting" in caplog.text
+
+
+def test_bytes_behind_the_container_are_left_out_with_a_warning(tmp_path, caplog):
+    path = tmp_path / "a.glb"
+    write_glb(path, archive_splats.room(5))
+    with path.open("ab") as file:
+        file.write(b"\n")
+    assert len(load_glb(path).splats) == 5
+    assert "1 bytes after its data" in caplog.text
 
 
 @pytest.mark.parametrize(("up", "axes"), [

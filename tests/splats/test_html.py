@@ -19,7 +19,7 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera
 from recon_cli.splats.axes import turn_from
 from recon_cli.splats.format import Tour
-from recon_cli.splats.html import PageStyle, default_view, find_title, read_html, write_html
+from recon_cli.splats.html import PageStyle, default_view, find_title, load_html, write_html
 from recon_cli.splats.spz import load_spz, spz_bytes
 
 Y_DOWN = np.array([0.0, -1, 0])
@@ -75,9 +75,9 @@ def test_a_page_reads_back_as_the_spz_of_the_same_scene(tmp_path, degree):
     splats = room(500, degree=degree)
     write_html(tmp_path / "a.html", splats)
     finest = spz_bytes(
-        tmp_path / "a.spz", turn_from("rub", splats), harmonic_step=1, axes=None)
+        tmp_path / "a.spz", turn_from("rub", splats), harmonic_step=1)
     (tmp_path / "a.spz").write_bytes(finest)
-    page = read_html(tmp_path / "a.html")
+    page = load_html(tmp_path / "a.html").splats
     spz = load_spz(tmp_path / "a.spz", axes="rub").splats
     assert torch.allclose(page.means, splats.means, atol=1e-3)
     for name, value in spz.parameters().items():
@@ -94,7 +94,7 @@ def test_a_scene_with_gaussians_too_large_for_spz_is_halved_and_read_back_as_it_
     text = (tmp_path / "a.html").read_text("utf-8")
     assert (f'data-halvings="{halvings}"' in text) == (halvings > 0)
     assert "smaller" not in caplog.text
-    back = read_html(tmp_path / "a.html")
+    back = load_html(tmp_path / "a.html").splats
     assert (back.log_scales - splats.log_scales).abs().max() <= 0.5 / 16 + 1e-5
     assert (back.means - splats.means).abs().max() <= 0.5 / 2**11
 
@@ -126,7 +126,7 @@ def test_no_name_can_add_an_element_or_a_scene(tmp_path):
     assert tags[0] == tags[1]
     [(_, title)] = Elements(hostile.read_text(encoding="utf-8")).of("title")
     assert title.rstrip("\n") == HOSTILE
-    assert len(read_html(hostile)) == 40
+    assert len(load_html(hostile).splats) == 40
 
 
 def test_a_name_that_is_no_text_becomes_some(tmp_path):
@@ -181,7 +181,7 @@ def test_without_cameras_the_page_opens_in_front_of_the_scene(up):
 
 def test_one_gaussian_makes_a_page(tmp_path):
     write_html(tmp_path / "a.html", room(1))
-    assert len(read_html(tmp_path / "a.html")) == 1
+    assert len(load_html(tmp_path / "a.html").splats) == 1
     assert told(tmp_path / "a.html")["reach"] > 0
 
 
@@ -242,12 +242,12 @@ def with_scene(make):
 def test_damaged_and_lying_pages_are_refused_with_the_reason(written, change, message):
     written.write_text(change(written.read_text(encoding="utf-8")), encoding="utf-8")
     with pytest.raises(FormatError, match=message):
-        read_html(written)
+        load_html(written)
 
 
 def test_a_missing_page_is_refused(tmp_path):
     with pytest.raises(FormatError, match="cannot be read"):
-        read_html(tmp_path / "none.html")
+        load_html(tmp_path / "none.html")
 
 
 @settings(max_examples=examples(100))
@@ -260,7 +260,7 @@ def test_a_damaged_page_gives_gaussians_or_a_format_error(tmp_path_factory, seed
     text = path.read_bytes()
     start = text.index(b'<script id="scene"')
     end = text.index(b"</script>", start)
-    read_or_refused(read_html, path, damaged(text[start:end + 9], seed))
+    read_or_refused(load_html, path, damaged(text[start:end + 9], seed))
 
 
 def test_names_of_files_are_not_in_the_page(tmp_path):

@@ -19,7 +19,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import joined, transformed
 from recon_cli.splats import html
-from recon_cli.splats.html import PageStyle, Tour, read_html, write_html
+from recon_cli.splats.html import PageStyle, Tour, load_html, write_html
 
 WIDTH, HEIGHT = 240, 180
 Y_DOWN = np.array([0.0, -1, 0])
@@ -63,7 +63,7 @@ def picture(page: WatchedPage) -> np.ndarray:
 
 def rendered(path: Path, camera: Camera, degree: int = 3) -> np.ndarray:
     """The same by recon's renderer, from the Gaussians in the page."""
-    splats = read_html(path)
+    splats = load_html(path).splats
     with torch.no_grad():
         rgb = render(splats, camera, torch.zeros(3), min(degree, splats.sh_degree)).rgb
     return rgb.clamp(0, 1).double().numpy()

@@ -123,7 +123,8 @@ def test_another_order_a_lower_degree_and_unknown_properties_are_read(tmp_path):
 
 @pytest.mark.parametrize(("change", "message"), [
     (lambda data: data[:-7], "truncated"),
-    (lambda data: data + b"1234", "truncated or damaged"),
+    (lambda data: data + bytes(20), "truncated or damaged"),
+    (lambda data: data.replace(b"property float nx\n", b""), "truncated or damaged"),
     (lambda data: data[:0], "not a .ply"),
     (lambda data: b"PK\x03\x04" + data, "not a .ply"),
     (lambda data: data.replace(b"vertex 20", b"vertex 2000000000"), "truncated"),
@@ -141,7 +142,11 @@ def test_another_order_a_lower_degree_and_unknown_properties_are_read(tmp_path):
     (lambda data: data.replace(b"float x\n", b"floot x\n"), "floot x"),
     (lambda data: data.replace(b"float x\n", b"uint packed_position\n"), "compressed .ply"),
     (lambda data: data.replace(b"float opacity", b"float opacite"), "lacks the properties"),
-    (lambda data: data.replace(b"float x\n", b"list uchar int x\n"), "vertex, which is lists"),
+    (lambda data: data.replace(b"float x\n", b"list uchar int x\n"), "lists, not Gaussians"),
+    (lambda data: re.sub(rb"property float (opacity|scale_\d|rot_\d)\n", rb"property float a\1\n",
+                         data), "point cloud"),
+    *((lambda data, name=name: data.replace(b"float ny", b"float " + name), "moving Gaussians")
+      for name in (b"trbf_center", b"motion_0", b"t", b"scale_t", b"rot_r_0")),
     (lambda data: data.replace(b"f_rest_44", b"g_rest_44"), "f_rest"),
     (lambda data: re.sub(rb"f_rest_(\d\n|1\d|20)", rb"g_rest_\1", data), "numbered from 0"),
     (lambda data: data.replace(b"float ny", b"float nx"), "twice"),
@@ -211,8 +216,27 @@ def test_a_mesh_is_refused_by_what_it_is(tmp_path, splats, form):
     face = b"3 0 1 2\n" if form == "ascii" else b"\3" + bytes(12)
     rewritten(path, form, tail=b"\nelement face 1\nproperty list uchar int vertex_indices\n"
               b"end_header\nBODY" + face)
-    with pytest.raises(FormatError, match="1 of face, which is a mesh, not Gaussians"):
+    with pytest.raises(FormatError, match="a mesh, not Gaussians: 1 of face") as caught:
         read_ply(path)
+    assert "again" not in caught.value.hint  # another copy is a mesh as well
+
+
+@pytest.mark.parametrize("tail", [b"\n", b"\r\n", bytes(3)])
+def test_a_few_bytes_after_the_data_are_left_out_with_a_warning(tmp_path, splats, tail, caplog):
+    path = tmp_path / "a.ply"
+    write_ply(path, splats)
+    with path.open("ab") as file:
+        file.write(tail)
+    assert torch.equal(read_ply(path).means, splats.means)
+    assert f"{len(tail)} bytes after its data" in caplog.text
+
+
+def test_a_header_of_hundreds_of_kilobytes_is_read(tmp_path, splats):
+    write_ply(tmp_path / "a.ply", splats, comments=["x" * 1000] * 300)
+    assert torch.equal(read_ply(tmp_path / "a.ply").means, splats.means)
+    write_ply(tmp_path / "a.ply", splats, comments=["x" * 1000] * 1100)
+    with pytest.raises(FormatError, match=r"not a \.ply"):
+        read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(("change", "message"), [

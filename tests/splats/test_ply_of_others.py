@@ -73,6 +73,25 @@ def test_a_number_of_coefficients_that_makes_no_degree_is_refused(tmp_path, coun
     assert caught.value.hint
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.2, 50.0])
+def test_the_filter_of_mip_splatting_widens_and_thins_gaussians(tmp_path, size, caplog):
+    """Yu et al. 2024, equation 9: covariance plus f^2, and the same mass in the larger volume."""
+    table = columns()
+    wanted = load_ply(written(tmp_path / "a.ply", table)).splats
+    table["filter_3D"] = np.full(N, size)
+    table["filter_3D"][1] = 0
+    back = load_ply(written(tmp_path / "b.ply", table)).splats
+    f = table["filter_3D"][:, None].astype(np.float32).astype(np.float64)
+    before, after = wanted.scales.double().numpy(), back.scales.double().numpy()
+    assert np.allclose(after, np.sqrt(before**2 + f**2), rtol=2e-6)
+    ratio = before.prod(axis=1) / np.sqrt(before**2 + f**2).prod(axis=1)
+    opacities = wanted.opacities.double().numpy() * ratio
+    assert np.allclose(back.opacities.double().numpy(), opacities, rtol=2e-5)
+    assert torch.allclose(back.logit_opacities[1], wanted.logit_opacities[1], atol=1e-4)
+    assert torch.equal(back.means, wanted.means)
+    assert "filter_3D" in caplog.text
+
+
 def test_doubles_far_away_are_moved_to_the_origin_before_they_are_rounded(tmp_path):
     table = columns()
     place = np.array([448262.31, 5411932.67, 301.5])

@@ -100,7 +100,7 @@ def test_version_2_is_version_3_with_bytes_of_rotations(tmp_path):
 
 def test_rotations_of_version_2_are_bytes_of_x_y_z(tmp_path):
     splats = few(3, 0)
-    write_spz(tmp_path / "a.spz", splats, axes=None)
+    write_spz(tmp_path / "a.spz", splats)
     data = plain(tmp_path / "a.spz")
     body = data[16:16 + 16 * 3]
     vectors = np.array([[0, 0, 0], [0.5, -0.5, 0.5], [0, -1, 0]])
@@ -113,7 +113,7 @@ def test_rotations_of_version_2_are_bytes_of_x_y_z(tmp_path):
     assert torch.equal(back.means, load_spz(tmp_path / "a.spz").splats.means)
 
 
-@pytest.mark.parametrize(("far", "bits"), [(1.0, 12), (2047.9, 12), (2048.0, 11), (32767.9, 8)])
+@pytest.mark.parametrize(("far", "bits"), [(8.0, 12), (2047.9, 12), (2048.0, 11), (32767.9, 8)])
 def test_positions_get_the_bits_that_the_extent_leaves(tmp_path, far, bits):
     splats = edge_splats(0, far=far)
     write_spz(tmp_path / "a.spz", splats)
@@ -171,7 +171,7 @@ def with_extension(path, kind, payload):
 @pytest.mark.parametrize("kind", [0xADBE0002, 0x12340001])
 def test_extensions_that_change_nothing_are_passed_over(tmp_path, version, kind):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), version=version, axes=None)
+    write_spz(path, few(), version=version)
     wanted = load_spz(path).splats
     with_extension(path, kind, b"\4\0\0\0")
     assert torch.equal(load_spz(path).splats.means, wanted.means)
@@ -186,7 +186,7 @@ def test_extensions_that_change_nothing_are_passed_over(tmp_path, version, kind)
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_the_axes_that_a_file_names_are_turned_into_ours(tmp_path, number, signs, up, version):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), version=version, axes=None)
+    write_spz(path, few(), version=version)
     stored = load_spz(path).splats
     with_extension(path, 0xADBE0003, struct.pack("<I", number))
     scene = load_spz(path)
@@ -201,33 +201,77 @@ def test_the_axes_that_a_file_names_are_turned_into_ours(tmp_path, number, signs
 
 def test_a_file_that_names_no_axes_stays_and_those_given_win(tmp_path):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), axes=None)
+    write_spz(path, few())
     stored = load_spz(path).splats
     assert load_spz(path).up is None
     turned = load_spz(path, axes="rub").splats
     assert torch.equal(turned.means, stored.means * torch.tensor([1, -1, -1]))
     with_extension(path, 0xADBE0003, struct.pack("<I", 0))  # unspecified
     assert torch.equal(load_spz(path).splats.means, stored.means)
-    write_spz(path, few(), axes="rub")
+    with_extension(path, 0xADBE0003, struct.pack("<I", 4))  # RUB
     assert torch.equal(load_spz(path).splats.means, stored.means * torch.tensor([1, -1, -1]))
     assert torch.equal(load_spz(path, axes="rdf").splats.means, stored.means)
 
 
-@pytest.mark.parametrize("version", [2, 3, 4])
-def test_the_file_names_its_axes_and_the_antialiasing_of_its_scene(tmp_path, version):
+@pytest.mark.parametrize("up", [None, "z", "-y", "y"])
+@pytest.mark.parametrize("version", [2, 3])
+def test_up_is_in_the_header_of_gzip_and_no_extension_is_written(tmp_path, version, up):
+    """three.js refuses files with an extension; every program skips the comment of gzip."""
     path = tmp_path / "a.spz"
-    write_spz(path, few(), version=version)
-    assert struct.pack("<III", 0xADBE0003, 4, 6) in (
-        path.read_bytes() if version == 4 else plain(path))
-    assert (load_spz(path).up, load_spz(path).antialiased) == ("-y", False)
-    write_spz(path, few(), version=version, axes="rfu", antialiased=True)
-    assert (load_spz(path).up, load_spz(path).antialiased) == ("z", True)
-    assert torch.equal(load_spz(path).splats.sh_dc, load_spz(path, axes="rfu").splats.sh_dc)
+    write_spz(path, few(), version=version, up=up, antialiased=up == "z")
+    data = plain(path)
+    assert len(data) == 16 + len(few()) * (64 if version == 2 else 65)  # and nothing behind it
+    assert data[14] == (up == "z")  # flags: no extension
+    scene = load_spz(path)
+    assert (scene.up, scene.antialiased) == (up, up == "z")
+    path.write_bytes(data)
+    assert torch.equal(scene.splats.means, load_spz(path).splats.means)
+
+
+@pytest.mark.parametrize(("up", "number", "signs", "read"), [
+    ("z", 12, [1, 1, 1], "z"), ("-y", 6, [1, 1, 1], "-y"), ("y", 4, [1, -1, -1], "-y")])
+def test_version_4_names_the_axes_of_its_values(tmp_path, up, number, signs, read):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=4)
+    stored = load_spz(path)
+    assert stored.up is None
+    write_spz(path, few(), version=4, up=up)
+    assert struct.pack("<III", 0xADBE0003, 4, number) in path.read_bytes()
+    scene = load_spz(path)
+    assert scene.up == read
+    assert torch.equal(scene.splats.means, stored.splats.means * torch.tensor(signs))
+
+
+@pytest.mark.parametrize(("size", "bits"), [(1e-2, 12), (1e-3, 14), (1e-4, 18), (1e-9, 23)])
+def test_positions_get_the_bits_that_fine_gaussians_need(tmp_path, size, bits):
+    """Half a step is 1/32 of the median Gaussian at most, as far as 24 bits hold the scene."""
+    splats = edge_splats(0, far=0.9)
+    splats.means.clamp_(-0.9, 0.9)
+    splats.log_scales[:] = np.log(size)
+    write_spz(tmp_path / "a.spz", splats)
+    assert plain(tmp_path / "a.spz")[13] == bits
+    off = greatest(load_spz(tmp_path / "a.spz").splats.means, splats.means)
+    assert off <= 0.5 / 2**bits + 1e-9
+    assert off <= size / 32 or bits == 23
+
+
+def test_version_1_has_positions_of_16_bits(tmp_path):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=2)
+    wanted, data = load_spz(path).splats, plain(path)
+    n = len(few())
+    halves = wanted.means.numpy().astype("<f2")
+    head = data[:4] + struct.pack("<I", 1) + data[8:16]
+    path.write_bytes(gzip.compress(head + halves.tobytes() + data[16 + 9 * n:]))
+    back = load_spz(path).splats
+    assert np.array_equal(back.means.numpy(), halves.astype(np.float32))
+    for name in ("quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest"):
+        assert torch.equal(getattr(back, name), getattr(wanted, name)), name
 
 
 def test_harmonics_of_degree_4_are_cut_to_degree_3_with_a_warning(tmp_path, caplog):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), axes=None)
+    write_spz(path, few())
     wanted, data = load_spz(path).splats, plain(path)
     n, start = len(few()), 16 + 20 * len(few())
     harmonics = np.frombuffer(data[start:], np.uint8).reshape(n, 15, 3)

@@ -29,8 +29,9 @@ def header(version=3, count=9, degree=3, bits=12, flags=0, streams=0) -> bytes:
     (lambda data: b"ply" + data, "SPZ"),
     (lambda data: data[:7], "truncated"),
     (lambda data: data[:-1], "truncated"),
-    (lambda data: data + b"1", "more than its header"),
-    (lambda data: header(version=1) + data[16:], "version 1"),
+    (lambda data: data + bytes(65), "more than its header"),
+    (lambda data: header(version=0) + data[16:], "version 0"),
+    (lambda data: header(version=1, count=12) + data[16:], "truncated"),
     (lambda data: header(version=5) + data[16:], "version 5"),
     (lambda data: header(degree=4) + data[16:], "truncated"),
     (lambda data: header(degree=5) + data[16:], "degree 5"),
@@ -49,7 +50,7 @@ def header(version=3, count=9, degree=3, bits=12, flags=0, streams=0) -> bytes:
 @pytest.mark.parametrize("zipped", [False, True])
 def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message, zipped):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), axes=None)
+    write_spz(path, few())
     data = change(plain(path))
     if zipped and message != "SPZ":
         data = gzip.compress(data)
@@ -61,7 +62,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message, zi
 @pytest.mark.parametrize(("change", "message"), [
     (lambda data: data[:20], "truncated"),
     (lambda data: data[:-1], "unpacked"),
-    (lambda data: data + b"1", "more than its header"),
+    (lambda data: data + bytes(65), "more than its header"),
     (lambda data: header(4, 10, streams=6) + data[16:], "bytes instead of 90"),
     (lambda data: header(4, 9, streams=5) + data[16:], "5 streams instead of 6"),
     (lambda data: header(4, 9, 0, streams=6) + data[16:], "6 streams instead of 5"),
@@ -73,7 +74,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message, zi
 ])
 def test_damaged_files_of_version_4_are_refused(tmp_path, change, message):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), version=4, axes=None)
+    write_spz(path, few(), version=4)
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(FormatError, match=message):
         load_spz(path)
@@ -84,12 +85,23 @@ def test_a_missing_file_and_a_damaged_gzip_are_refused(tmp_path):
         with pytest.raises(FormatError, match="cannot be read"):
             load_spz(path)
     path = tmp_path / "a.spz"
-    write_spz(path, few(), axes=None)
+    write_spz(path, few())
     data = path.read_bytes()
-    for bad in (data[:12], data[:-3], data[:40] + b"\0" + data[41:], data + b"more"):
+    for bad in (data[:12], data[:-3], data[:40] + b"\0" + data[41:]):
         path.write_bytes(bad)
         with pytest.raises(FormatError):
             load_spz(path)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_bytes_behind_the_data_are_left_out_with_a_warning(tmp_path, version, caplog):
+    path = tmp_path / "a.spz"
+    write_spz(path, few(), version=version)
+    wanted = load_spz(path).splats.means
+    with path.open("ab") as file:
+        file.write(b"\n")
+    assert load_spz(path).splats.means.equal(wanted)
+    assert "1 bytes after its data" in caplog.text
 
 
 def refused_at(path, limit: int) -> str:
@@ -106,7 +118,7 @@ def refused_at(path, limit: int) -> str:
 
 def test_a_gzip_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), axes=None)
+    write_spz(path, few())
     path.write_bytes(gzip.compress(plain(path) + bytes(200 * MIB)))
     assert "more than its header" in refused_at(path, 2 * MIB)
 
@@ -114,7 +126,7 @@ def test_a_gzip_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path):
 @pytest.mark.parametrize("known", [True, False])
 def test_a_zstd_stream_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path, known):
     path = tmp_path / "a.spz"
-    write_spz(path, few(degree=0), version=4, axes=None)
+    write_spz(path, few(degree=0), version=4)
     data = path.read_bytes()
     sizes = [struct.unpack_from("<QQ", data, 32 + 16 * i) for i in range(5)]
     packer = zstandard.ZstdCompressor(write_content_size=known)
@@ -127,7 +139,7 @@ def test_a_zstd_stream_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path, 
 @pytest.mark.parametrize("version", [3, 4])
 def test_a_count_that_no_file_of_this_size_holds_is_refused(tmp_path, version):
     path = tmp_path / "a.spz"
-    write_spz(path, few(), version=version, axes=None)
+    write_spz(path, few(), version=version)
     data = plain(path) if version == 3 else path.read_bytes()
     data = data[:8] + struct.pack("<I", 50_000_000) + data[12:]
     path.write_bytes(gzip.compress(data) if version == 3 else data)
