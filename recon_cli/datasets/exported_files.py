@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from recon_cli.datasets.app_frames import LeftOut
 from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
+from recon_cli.datasets.file_finder import shared_folders
 from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, find_images
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import Lens, make_lens
@@ -21,9 +22,9 @@ _PICTURES = frozenset(suffix.lower() for suffix in SUFFIXES)
 _FAR = 1e4
 _MOST_OFF = 0.25  # pixels by which a lens without r^8 may miss one that has it
 _FITS = 3.0  # points of the same world lie within so many times the extent of the cameras
-# Points of a model lie on surfaces, of which a scan of the same world leaves out less than half:
-# the nearest of its points is this near, as a share of the extent. Of so many points each is asked.
-_NEAR, _ASKED = 0.05, 2000
+# Points of a model lie on surfaces, most of which a scan of the same world shows too: one of a
+# hundred points spread over them is this near, as a share of the extent. So many are asked.
+_NEAR, _ASKED = 0.1, 2000
 
 
 def list_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -45,23 +46,13 @@ def list_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
         fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
         if len(fitting) > 1:
-            shared = [_shared(path.parts, parts) for path in fitting]
+            shared = [shared_folders(path.parts[:-1], parts[:-1]) for path in fitting]
             best = max(shared)
             fitting = [path for path, count in zip(fitting, shared, strict=True) if count == best]
         if len(fitting) == 1:
             found[name] = fitting[0]
     taken = list(found.values())
     return {name: path for name, path in found.items() if taken.count(path) == 1}
-
-
-def _shared(path: Sequence[str], other: Sequence[str]) -> int:
-    """Returns how many folders two paths share at their ends."""
-    count = 0
-    for one, two in zip(reversed(path[:-1]), reversed(other[:-1]), strict=False):
-        if one.casefold() != two.casefold():
-            break
-        count += 1
-    return count
 
 
 def solved_set(
@@ -152,7 +143,7 @@ def _fits(points: NDArray[np.float64], posed: PosedSet) -> bool:
     if posed.points is None or not len(posed.points):
         return True
     some = posed.points[::max(1, len(posed.points) // _ASKED)]
-    return bool(np.median(KDTree(points).query(some)[0]) <= _NEAR * _extent(posed.points))
+    return bool(np.median(KDTree(points).query(some)[0]) <= _NEAR * extent)
 
 
 def _extent(points: NDArray[np.float64]) -> float:

@@ -176,9 +176,9 @@ def _attach_masks(posed: PosedSet, folder: Path) -> PosedSet:
     bare = {image.name: PurePosixPath(image.name) for image in posed.images if image.mask is None}
     listed = {image.mask for image in posed.images}
     homes = dict.fromkeys([folder, *(
-        image.path.parents[len(PurePosixPath(image.name).parts)] for image in posed.images
+        image.path.parents[len(PurePosixPath(image.name).parts) - above] for image in posed.images
         if image.path.is_relative_to(folder) and len(image.path.relative_to(folder).parts)
-        > len(PurePosixPath(image.name).parts))])
+        > len(PurePosixPath(image.name).parts) for above in (0, 1))])
     found: dict[str, Path] = {}
     unused: list[str] = []
     for place in dict.fromkeys(place for home in homes for place in mask_folders(home)):
