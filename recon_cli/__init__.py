@@ -5,8 +5,15 @@ Public names are loaded when they are first used, so that `import recon_cli` tak
 
 from __future__ import annotations
 
+import sys
+
+# pycolmap's wheel exports a zlib of its own. Where it loads first, and Python's zlib is a library
+# beside it, the two get mixed up: compressing aborts with "free(): invalid pointer".
+import zlib as zlib
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from recon_cli.errors import BackendError
 
 if TYPE_CHECKING:  # for type checkers; at run time `__getattr__` does the same
     from recon_cli.api import (
@@ -39,6 +46,19 @@ _PUBLIC = {
 
 __all__ = ["Camera", "ReconError", "Splats", "Workspace", "__version__", "evaluate", "look_at",
            "make_camera", "rasterization", "read_cameras"]
+
+
+def _check_import_order() -> None:
+    """Raises BackendError where compressing anything would end the process."""
+    order = [name for name in sys.modules if name in ("zlib", "pycolmap._core")]
+    if (order == ["pycolmap._core", "zlib"] and sys.platform == "linux"
+            and "zlib" not in sys.builtin_module_names):
+        raise BackendError(
+            "pycolmap was imported before zlib, so that Python aborts when it compresses anything.",
+            hint="Import recon_cli, or zlib, before pycolmap.")
+
+
+_check_import_order()
 
 
 def __getattr__(name: str) -> Any:

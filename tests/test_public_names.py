@@ -25,3 +25,25 @@ def test_the_package_alone_imports_nothing_heavy() -> None:
             "print(*{'torch', 'numpy', 'numba', 'click'} & set(sys.modules))")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+SQUEEZE = "import zlib; print(len(zlib.decompress(zlib.compress(bytes(100000)))))"
+
+
+@pytest.mark.parametrize("first", ["import recon_cli, pycolmap", "import zlib, pycolmap, recon_cli",
+                                   "from recon_cli import Workspace; import pycolmap"])
+def test_beside_pycolmap_compressing_works(first: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", f"{first}; {SQUEEZE}"], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["100000"]
+
+
+@pytest.mark.skipif(sys.platform != "linux" or "zlib" in sys.builtin_module_names,
+                    reason="here zlib is no library that pycolmap's could be mixed up with")
+@pytest.mark.parametrize("then", ["from recon_cli import Workspace", "import recon_cli.api"])
+def test_after_pycolmap_alone_the_import_says_what_comes_first(then: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", f"import pycolmap; {then}"], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "BackendError" in done.stderr
+    assert "before zlib" in done.stderr

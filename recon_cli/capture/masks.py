@@ -2,7 +2,8 @@
 
 White counts, black is ignored. Masks lie in masks/ inside the given folder, or inside its subfolder
 that holds the photos. A mask is named after its photo, with .png or another picture's suffix in
-place of the photo's or, as for COLMAP, appended to it. Masks beside the given folder are not used.
+place of the photo's or, as for COLMAP, appended to it; RealityScan's names are known, too. Masks
+beside the given folder are not used.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FolderMasks:
         names = {
             photo.name: PurePosixPath(photo.name) if folder in inner
             else PurePosixPath(photo.path.name) for photo in photos
-            if folder in inner or photo.path.parent == folder.parent}
+            if folder in inner or photo.path.parent in (folder, folder.parent)}
         found, left = match_masks(folder, names)
         by_photo = {**found, **by_photo}
         unused += left

@@ -17,6 +17,7 @@ from recon_cli.capture.archives import is_archive
 from recon_cli.capture.foreign import Found, find_foreign
 from recon_cli.capture.images import PHOTO_SUFFIXES, inspect_photo
 from recon_cli.capture.mask_files import FOLDERS as MASK_FOLDERS
+from recon_cli.capture.mask_files import is_mask_file
 from recon_cli.capture.picture_names import picture_kind
 from recon_cli.errors import InputError, list_names
 from recon_cli.workspace.layout import Workspace
@@ -232,7 +233,8 @@ def _walk(home: Path, foreign: Sequence[Found], out: Path | None) -> _Walk:
 
 def _is_excluded(path: Path, foreign: Sequence[Found]) -> bool:
     """Returns whether the program that wrote a file does not mean it for a photo."""
-    return any(path.match(pattern) for found in foreign for pattern in found.row.not_photos)
+    return is_mask_file(path) or any(
+        path.match(pattern) for found in foreign for pattern in found.row.not_photos)
 
 
 def _subfolders(folder: Path, out: Path | None) -> list[Path]:

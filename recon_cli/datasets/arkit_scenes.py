@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from recon_cli.datasets.app_frames import (
     MILLIMETRE,
@@ -26,14 +25,13 @@ from recon_cli.datasets.app_frames import (
 )
 from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
+from recon_cli.datasets.trajectory import Trajectory
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import Lens
 
 _KINDS = ("wide", "vga_wide", "lowres_wide")  # the largest pictures first
 _TRAJ = "lowres_wide.traj"
 _NEAR = 0.0015  # seconds between files of one frame; they are written to the millisecond
-_EXACT = 0.005  # seconds to a pose that is taken as it is, as nerfstudio does
-_GAP = 0.25  # seconds between poses, written every .1 s, over which none is interpolated
 _HINT = "Download the recording again."
 
 
@@ -61,7 +59,7 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
     images = _by_time(home / kind)
     inner = _by_time(home / f"{kind}_intrinsics", (".pincam",))
     depths, levels = _by_time(home / "lowres_depth"), _by_time(home / "confidence")
-    path = _Trajectory(home / _TRAJ)
+    path = _read_trajectory(home / _TRAJ)
     left_out, listed = LeftOut(), []
     for time, image in images.items():
         text = _nearest(inner, time)
@@ -116,49 +114,21 @@ def _read_lens(text: Path, image: Path, left_out: LeftOut) -> Lens | None:
     return left_out.lens(image.name, size, tuple, inner)
 
 
-class _Trajectory:
-    """Poses by time."""
+def _read_trajectory(path: Path) -> Trajectory:
+    """Returns the poses of a .traj; a last line that is cut short is left out.
 
-    def __init__(self, path: Path) -> None:
-        """Reads a .traj; a last line that is cut short is left out. FormatError if damaged."""
-        lines = [line.split() for line in
-                 path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-        if lines and len(lines[-1]) != 7:
-            lines.pop()
-        try:
-            values = np.array(lines, np.float64).reshape(-1, 7)
-        except ValueError as error:
-            raise FormatError(
-                f"{path} does not hold 7 numbers a line.", hint=_HINT) from error
-        values = values[np.isfinite(values).all(axis=1)]
-        values = values[np.argsort(values[:, 0], kind="stable")]
-        values = values[np.r_[True, np.diff(values[:, 0]) > 0]] if len(values) else values
-        if len(values) < 2:
-            raise InputError(f"{path} holds {len(values)} poses.", hint=_HINT)
-        self._times = values[:, 0]
-        turns = Rotation.from_rotvec(values[:, 1:4])
-        self._rotations = turns.as_matrix()  # world to camera
-        self._slerp = Slerp(self._times, turns)
-        self._shifts = values[:, 4:7]
-        self._centers = -np.einsum("nji,nj->ni", self._rotations, self._shifts)
-
-    def viewmat(self, time: float) -> NDArray[np.float64] | None:
-        """Returns [4, 4] world to camera: that of the time, else between its neighbours."""
-        at = int(np.searchsorted(self._times, time))
-        result = np.eye(4)
-        for near in (at - 1, at):
-            if 0 <= near < len(self._times) and abs(self._times[near] - time) <= 1e-6:
-                result[:3, :3], result[:3, 3] = self._rotations[near], self._shifts[near]
-                return result
-        if not 0 < at < len(self._times) or self._times[at] - self._times[at - 1] > _GAP:
-            near = min(max(at - 1, 0), len(self._times) - 1, key=lambda one: abs(
-                self._times[one] - time)) if len(self._times) else 0
-            if abs(self._times[near] - time) > _EXACT:
-                return None
-            result[:3, :3], result[:3, 3] = self._rotations[near], self._shifts[near]
-            return result
-        share = (time - self._times[at - 1]) / (self._times[at] - self._times[at - 1])
-        center = (1 - share) * self._centers[at - 1] + share * self._centers[at]
-        result[:3, :3] = self._slerp(time).as_matrix()
-        result[:3, 3] = -result[:3, :3] @ center
-        return result
+    FormatError if it is damaged; InputError if it holds fewer than two.
+    """
+    lines = [line.split() for line in
+             path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    if lines and len(lines[-1]) != 7:
+        lines.pop()
+    try:
+        values = np.array(lines, np.float64).reshape(-1, 7)
+    except ValueError as error:
+        raise FormatError(f"{path} does not hold 7 numbers a line.", hint=_HINT) from error
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < 2:
+        raise InputError(f"{path} holds {len(values)} poses.", hint=_HINT)
+    turns = Rotation.from_rotvec(values[:, 1:4]).inv()
+    return Trajectory(values[:, 0], turns, -turns.apply(values[:, 4:7]))

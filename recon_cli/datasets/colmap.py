@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.datasets.exported_files import read_points
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.posed import (
     SUFFIXES,
@@ -149,7 +150,10 @@ def read_colmap(folder: Path) -> PosedSet:
     posed = find_images("colmap", listed, model_at, missing=missing)
     if len(model.points):
         posed = replace(posed, points=model.points, colors=model.colors)
-    return replace(posed, notices=(*model_notices, *notices, *posed.notices))
+    posed = replace(posed, notices=(*model_notices, *notices, *posed.notices))
+    # INRIA's trainer and those after it start from it, and write it of the model's own points.
+    file = model_at / "points3D.ply"
+    return read_points(posed, file) if is_file(file) else posed
 
 
 def list_cameras(folder: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:

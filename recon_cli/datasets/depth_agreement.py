@@ -1,44 +1,55 @@
-"""Whether the depth of posed images fits their poses: in another unit, or upside down, it does not.
+"""The scale by which the depth of posed images fits their poses, and what it is then in.
 
-Points of one image's depth are seen from another one, and compared with the depth there. Units and
-the order of rows are tried; what fits clearly better than the depth as it is read shows the fault.
+Points of one image's depth are seen from another one and compared with the depth there, at all
+scales; where a set has points, depth is compared with these first. Every view or pair gives an
+estimate of its own, and their scatter says how sure all of them are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cache, partial
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.datasets.posed import PosedImage
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import undistort_pixels
+from recon_cli.io.depth_maps import MOST_NOISE
 from recon_cli.scene.camera import Lens
 
-# Pairs whose cameras are apart by this share of the depth, and look alike: a smaller motion shows
-# no scale, and of others little is seen by both.
-_LEAST_MOVED, _MOST_TURNED_DEG = 0.2, 40.0
-_PAIRS, _TRIES = 12, 30  # pairs that are compared; images after each that are tried, ever farther
+# Units of a stored value, in metres: what cameras and data sets write.
+_UNITS = {
+    1.0: "metres", 1e-3: "millimetres", 1e-4: "1/10000 m", 1 / 4000: "1/4000 m",
+    1 / 5000: "1/5000 m", 1 / 6553.5: "1/6553.5 m"}
+# Neighbouring units are 25% apart, so that a scale this near to one is near to no other.
+_FITS = 0.1
+_SURE = _FITS / 2  # standard error of the logarithm of a scale: two of them stay within _FITS
+_LEAST_ESTIMATES = 3  # whose scatter tells anything
+_STARTS, _RANKS = 12, 7  # images that are compared, with the 1st, 2nd, 4th to 64th nearest others
+# Pairs whose cameras are apart by these shares of the depth, and look alike: of less a phone's
+# error of a centimetre is too large a part, and beyond it little is seen by both.
+_LEAST_MOVED, _MOST_MOVED, _MOST_TURNED_DEG = 0.2, 1.0, 40.0
 _GRID = 40  # samples a side of a depth map
 _FEWEST = 100  # samples of a pair that both see
-_SCALES = np.geomspace(1e-3, 1e3, 61)  # steps of 26%, half of which the least motion shows by 2.6%
-# Relative errors, as a median. In two rendered rooms with 1% of noise and the drift of a phone,
-# depth as it is has 1.3%, in another unit or order 8 to 43%; in a phone's recording of a door 2.3%.
-# A fault is told if it exceeds the first, and something else stays below the second and a third.
-_POOR, _GOOD, _CLEARLY = 0.05, 0.03, 3.0
-# A scale that is right is better than one this many times as large, by this factor.
-_NEXT, _CLEARER = 3.0, 1.5
+_LEAST_POINTS = 20  # of a view
+_MEDIAN = 5  # pixels a side of the median that takes a sensor's noise, and leaves edges
+_STEPS, _FINE = 9, np.geomspace(0.8, 1.25, 21)  # of the scales that are tried: 22%, then 2%
+# A scale shows, or is better than another one, if the other's error is this many times its own.
+_SHOWN = 1.5
+# Relative errors, as a median. Depth as it is has 1% in two rendered rooms with 1% of noise, and 3%
+# in a phone's recording of a door; in another order of rows or columns it has 5 to 26%.
+_GOOD, _CLEARLY = 0.03, 1 / 3
 
 Turn = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+_AS_READ: Turn = lambda depth: depth  # noqa: E731
 _ORDERS: dict[str, Turn] = {
-    "": lambda depth: depth, "upside down": lambda depth: depth[::-1],
+    "upside down": lambda depth: depth[::-1],
     "with left and right swapped": lambda depth: depth[:, ::-1]}
-
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,68 +61,177 @@ class View:
     viewmat: NDArray[np.float64]
 
 
-def find_fault(images: Sequence[PosedImage]) -> str:
-    """Returns what would make depth fit the poses, in words; empty if it fits, or nothing does."""
-    pairs = _choose_pairs(images)
-    if not pairs:
+@dataclass(frozen=True)
+class DepthFit:
+    """How depth fits the poses."""
+
+    factor: float = 1.0  # by which it is to be multiplied
+    shown: bool = False  # whether the poses, or points, show that it fits so
+    fault: str = ""  # why it is not to be used, as part of a sentence
+    words: str = ""  # what a factor other than 1 means
+    contradicts: bool = False  # the fault may be that of the poses
+
+
+class _Estimate(NamedTuple):
+    scale: float  # by which depth fits
+    errors: Callable[[NDArray[np.float64]], NDArray[np.float64]]  # relative, at scales
+
+
+def fit_depth(
+    images: Sequence[PosedImage], points: NDArray[np.float64] | None = None
+) -> DepthFit:
+    """Returns how the depth of images fits their poses, or the points [P, 3] of their world.
+
+    Depth as it is read is right if nothing shows its scale, as where cameras do not move.
+    """
+    images = [image for image in images if image.depth is not None]
+    viewmats = [image.viewmat for image in images]
+
+    @cache
+    def read(at: int) -> View | None:
+        return _read(images[at])
+
+    sources = [_ask_pairs(viewmats, read, _AS_READ),
+               [] if points is None else _ask_points(points, map(read, _spread(len(images))))]
+    sources = [estimates for estimates in sources if len(estimates) >= _LEAST_ESTIMATES]
+    for estimates in sources:
+        scale = _combine(estimates)
+        if scale is not None and not _find_order(viewmats, read, _error(estimates, scale)):
+            assert images[0].depth is not None
+            return _name(estimates, scale, images[0].depth.unit)
+    as_read = min((_error(estimates, 1.0) for estimates in sources), default=np.inf)
+    if words := _find_order(viewmats, read, as_read):
+        return DepthFit(fault=words)
+    if sources and as_read > MOST_NOISE:
+        return DepthFit(fault="it fits the poses in no unit", contradicts=True)
+    return DepthFit()
+
+
+def _name(estimates: Sequence[_Estimate], scale: float, unit: float) -> DepthFit:
+    """Returns what a scale means for depth that is read with a unit."""
+    own = min(_UNITS, key=lambda one: abs(np.log(scale * unit / one)))
+    as_read = _error(estimates, 1.0)
+    if _is_near(scale, own / unit) and not _is_near(own / unit, 1.0) and (
+            as_read >= _SHOWN * _error(estimates, own / unit)):
+        return DepthFit(own / unit, True, words=f"in {_UNITS[own]}, not in {_describe(unit)}")
+    if _is_near(scale, 1.0) or as_read < _SHOWN * _error(estimates, scale):
+        return DepthFit(shown=_is_near(scale, 1.0))
+    return DepthFit(fault=f"it would fit the poses with values about {scale:.2g} times as large, "
+                    "which is no usual unit")
+
+
+def _describe(unit: float) -> str:
+    return next((words for own, words in _UNITS.items() if abs(unit / own - 1) < 1e-3),
+                f"units of {unit:.4g}")
+
+
+def _is_near(scale: float, other: float) -> bool:
+    return abs(scale / other - 1) <= _FITS
+
+
+def _combine(estimates: Sequence[_Estimate]) -> float | None:
+    """Returns the median scale, None where the estimates are too far apart to be sure of it."""
+    logs = np.log([estimate.scale for estimate in estimates])
+    middle = float(np.median(logs))
+    # of the median of a normal distribution, by the median distance from it
+    spread = 1.2533 * 1.4826 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    scale = float(np.exp(middle))
+    return scale if spread <= _SURE and _error(estimates, scale) <= MOST_NOISE else None
+
+
+def _error(estimates: Sequence[_Estimate], scale: float) -> float:
+    """Returns the relative error at a scale, as a median."""
+    return float(np.median([estimate.errors(np.array([scale]))[0] for estimate in estimates]))
+
+
+def _find_order(
+    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], View | None], error: float
+) -> str:
+    """Returns the fault of depth whose rows or columns are in another order, empty if none is."""
+    if error <= _GOOD:
         return ""
-    as_read = _error(pairs, 1.0, _ORDERS[""])
-    if not as_read > _POOR:
-        return ""
-    errors = {(scale, words): _error(pairs, scale, turn)
-              for words, turn in _ORDERS.items() for scale in (_SCALES if not words else (1.0,))}
-    (scale, words), best = min(errors.items(), key=lambda item: item[1])
-    if not best < min(_GOOD, as_read / _CLEARLY):
-        return ""
-    # Of what is far enough, no motion shows: such a scale fits anything as well as a larger one.
-    if not words and _error(pairs, scale * _NEXT, _ORDERS[""]) < _CLEARER * best:
-        return ""
-    return words or f"with values about {scale:.2g} times as large"
+    for words, turn in _ORDERS.items():
+        turned = _ask_pairs(viewmats, read, turn)
+        if len(turned) >= _LEAST_ESTIMATES and (scale := _combine(turned)) and _error(
+                turned, scale) <= min(_GOOD, _CLEARLY * error):
+            return f"it would fit the poses {words}"
+    return ""
 
 
 def compare_views(views: Sequence[View]) -> float:
     """Returns how far depth from different places is apart, relatively, as a median."""
-    pairs = _pair_up(list(views), [view.viewmat for view in views], lambda view: view)
-    return _error(pairs, 1.0, _ORDERS[""]) if pairs else np.inf
+    viewmats = [view.viewmat for view in views]
+    errors = []
+    for at in _spread(len(views)):
+        least = _LEAST_MOVED * float(np.median(views[at].depth[views[at].depth > 0]))
+        other = next(_list_partners(viewmats, at, least), None)
+        if other is not None:
+            errors += list(_compare(views[at], views[other], _AS_READ, np.ones(1)))
+    known = [error for error in errors if np.isfinite(error)]
+    return float(np.median(known)) if len(known) >= max(1, len(errors) // 2) else np.inf
 
 
-def _choose_pairs(images: Sequence[PosedImage]) -> list[tuple[View, View]]:
-    """Returns pairs of images with depth that see the same from different places."""
-    with_depth = [image for image in images if image.depth is not None]
-    return _pair_up(with_depth, [image.viewmat for image in with_depth], _read)
+def _spread(count: int) -> list[int]:
+    """Returns the places of some items, evenly spread."""
+    return sorted({int(at) for at in np.linspace(0, count - 1, _STARTS)}) if count else []
 
 
-def _pair_up(
-    items: Sequence[Item], viewmats: Sequence[NDArray[np.float64]],
-    read: Callable[[Item], View | None],
-) -> list[tuple[View, View]]:
-    last = len(items) - 1
-    starts = sorted({int(at) for at in np.linspace(0, last, 2 * _PAIRS)}) if last > 0 else []
-    pairs: list[tuple[View, View]] = []
-    for start in starts:
-        one = read(items[start])
-        if one is None or len(pairs) == _PAIRS:
+def _ask_points(
+    points: NDArray[np.float64], views: Iterator[View | None]
+) -> list[_Estimate]:
+    """Returns the scale of the depth of each view by points that it sees, most of them."""
+    estimates = []
+    for view in views:
+        if view is None:
             continue
-        typical = float(np.median(one.depth[one.depth > 0]))
-        for step in sorted({int(at) for at in np.geomspace(1, max(last - start, 1), _TRIES)}):
-            at = min(start + step, last)
-            if _sees_alike(one.viewmat, viewmats[at], typical):
-                view = read(items[at])
-                if view is not None:
-                    pairs.append((one, view))
-                break
-    return pairs
+        local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        there = _look_up(view, local)
+        ratios = there[there > 0] / local[there > 0, 2]
+        if len(ratios) >= _LEAST_POINTS:
+            estimates.append(_Estimate(
+                1 / float(np.median(ratios)), partial(_compare_ratios, ratios)))
+    return estimates
 
 
-def _sees_alike(one: NDArray[np.float64], other: NDArray[np.float64], depth: float) -> bool:
-    """Returns whether cameras differ in place by enough of a depth, and hardly in direction.
+def _compare_ratios(
+    ratios: NDArray[np.float64], scales: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.asarray(np.median(np.abs(np.outer(scales, ratios) - 1), axis=1))
 
-    The depth may be in another unit, so that a motion counts that is large by any unit or little.
+
+def _ask_pairs(
+    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], View | None], turn: Turn
+) -> list[_Estimate]:
+    """Returns the scale by which the depth of an image fits that of another, where it shows.
+
+    Of each image the farthest other one is asked that shows it.
     """
-    motion = other @ np.linalg.inv(one)
-    turned = np.degrees(np.arccos(np.clip(motion[2, 2], -1, 1)))
-    moved = float(np.linalg.norm(motion[:3, 3]))
-    return bool(turned <= _MOST_TURNED_DEG and moved >= _LEAST_MOVED * min(depth, 2.0))
+    estimates = []
+    for at in _spread(len(viewmats)):
+        one = read(at)
+        if one is None:
+            continue
+        for partner in reversed([*_list_partners(viewmats, at)]):
+            other = read(partner)
+            estimate = None if other is None else _fit_pair(one, other, turn)
+            if estimate is not None:
+                estimates.append(estimate)
+                break
+    return estimates
+
+
+def _list_partners(
+    viewmats: Sequence[NDArray[np.float64]], at: int, least: float = 0.0
+) -> Iterator[int]:
+    """Yields other cameras that look alike and moved by so much, ever farther away."""
+    motions = np.stack(viewmats) @ np.linalg.inv(viewmats[at])
+    moved = np.linalg.norm(motions[:, :3, 3], axis=1)
+    alike = motions[:, 2, 2] >= np.cos(np.radians(_MOST_TURNED_DEG))
+    order = [int(other) for other in np.argsort(moved, kind="stable")
+             if alike[other] and moved[other] > 0 and moved[other] >= least]
+    for rank in range(_RANKS):
+        if 1 << rank <= len(order):
+            yield order[(1 << rank) - 1]
 
 
 def _read(image: PosedImage) -> View | None:
@@ -125,42 +245,66 @@ def _read(image: PosedImage) -> View | None:
         depth[levels == 0] = 0
     if not depth.any():
         return None
-    return View(depth, image.depth.own_lens(*depth.shape[::-1]), image.viewmat)
+    lens = image.depth.own_lens(*depth.shape[::-1])
+    return View(cv2.medianBlur(depth, _MEDIAN), lens, image.viewmat)
 
 
-def _error(pairs: Sequence[tuple[View, View]], scale: float, turn: Turn) -> float:
-    """Returns the median error over pairs; infinite where too little is seen by both."""
-    found = [_compare(one, other, scale, turn) for one, other in pairs]
-    known = [error for error in found if np.isfinite(error)]
-    return float(np.median(known)) if len(known) >= max(1, len(pairs) // 2) else np.inf
+def _fit_pair(one: View, other: View, turn: Turn) -> _Estimate | None:
+    """Returns the scale that fits a pair best, None if others fit it about as well."""
+    moved = float(np.linalg.norm((other.viewmat @ np.linalg.inv(one.viewmat))[:3, 3]))
+    scales = moved / float(np.median(one.depth[one.depth > 0])) * np.geomspace(
+        1 / _MOST_MOVED, 1 / _LEAST_MOVED, _STEPS)
+    compare = partial(_compare, one, other, turn)
+    best = scales[np.argmin(compare(scales))] * _FINE
+    errors = compare(best)
+    at = int(np.argmin(errors))
+    scale = float(best[at])
+    # clearly better than half and twice of it
+    beside = compare(scale * np.array([0.5, 2.0]))
+    if not 0 < at < len(best) - 1 or not (beside >= _SHOWN * errors[at]).all():
+        return None
+    return _Estimate(scale, compare)
 
 
-def _compare(one: View, other: View, scale: float, turn: Turn) -> float:
-    """Returns the median relative error of depth that one image predicts for another."""
-    depth, there = turn(one.depth), turn(other.depth)
+def _compare(
+    one: View, other: View, turn: Turn, scales: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns the median relative error [S] of depth that one image predicts for another.
+
+    It is infinite at scales [S] at which too little is seen by both.
+    """
+    depth = turn(one.depth)
     height, width = depth.shape
     rows, columns = (axis.ravel() for axis in np.meshgrid(
         np.linspace(0, height - 1, min(_GRID, height)).astype(int),
         np.linspace(0, width - 1, min(_GRID, width)).astype(int), indexing="ij"))
     rays = undistort_pixels(one.lens, np.column_stack([columns, rows]) + 0.5)
-    z = depth[rows, columns].astype(np.float64) * scale
+    z = depth[rows, columns].astype(np.float64)
     good = (z > 0) & np.isfinite(rays).all(axis=1)
     points = np.column_stack([rays[good] * z[good, None], z[good]])
     motion = other.viewmat @ np.linalg.inv(one.viewmat)
-    seen = points @ motion[:3, :3].T + motion[:3, 3]
-    seen = seen[seen[:, 2] > 0]
-    fx, fy, cx, cy = _pinhole(other.lens)
-    u = np.floor(seen[:, 0] / seen[:, 2] * fx + cx).astype(int)
-    v = np.floor(seen[:, 1] / seen[:, 2] * fy + cy).astype(int)
-    inside = (u >= 0) & (v >= 0) & (u < there.shape[1]) & (v < there.shape[0])
-    expected, found = seen[inside, 2], there[v[inside], u[inside]].astype(np.float64) * scale
-    known = found > 0
-    if known.sum() < min(_FEWEST, len(rows) // 4):
-        return np.inf
-    return float(np.median(np.abs(expected[known] / found[known] - 1)))
+    seen = scales[:, None, None] * (points @ motion[:3, :3].T) + motion[:3, 3]
+    found = _look_up(View(turn(other.depth), other.lens, other.viewmat), seen) * scales[:, None]
+    errors = np.full(len(scales), np.inf)
+    for at, (expected, there) in enumerate(zip(seen[..., 2], found, strict=True)):
+        known = there > 0
+        if known.sum() >= max(1, min(_FEWEST, len(rows) // 4)):
+            errors[at] = np.median(np.abs(expected[known] / there[known] - 1))
+    return errors
 
 
-def _pinhole(lens: Lens) -> tuple[float, float, float, float]:
-    """Returns fx, fy, cx, cy without distortion, which moves few pixels to another surface."""
-    params = lens.params if len(lens.params) > 3 else (lens.params[0], *lens.params)
-    return params[0], params[1], params[2], params[3]
+def _look_up(view: View, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the depth of a view where its camera sees points [..., 3], 0 where it does not.
+
+    Distortion is left out: it moves few pixels to another surface.
+    """
+    params = view.lens.params
+    fx, fy, cx, cy = params[:4] if len(params) > 3 else (params[0], *params[:3])
+    height, width = view.depth.shape
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = seen[..., 0] / seen[..., 2] * fx + cx
+        v = seen[..., 1] / seen[..., 2] * fy + cy
+        inside = (seen[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    found = np.zeros(inside.shape)
+    found[inside] = view.depth[v[inside].astype(int), u[inside].astype(int)]
+    return found

@@ -91,7 +91,7 @@ class DepthFile:
         FormatError if the file is missing, damaged or no depth.
         """
         if self.make is not None:
-            return self.make()
+            return self.make() * np.float32(self.unit)
         shape = self.shape
         if shape is None and self.path.suffix.lower() in _PACKED:
             shape = _shape_like(self.path, self.lens)
@@ -113,6 +113,10 @@ class DepthFile:
         """Returns the intrinsics of the depth map, of this size."""
         own = self.own if self.own is not None else self.lens.resized(width, height)
         return own if (width, height) == (own.width, own.height) else own.resized(width, height)
+
+    def scaled(self, factor: float) -> DepthFile:
+        """Returns the same depth in other units; the reliable range stays."""
+        return replace(self, unit=self.unit * factor)
 
     def with_lens(self, lens: Lens) -> DepthFile:
         """Returns the depth of the same image with other intrinsics."""

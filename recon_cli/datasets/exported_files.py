@@ -8,9 +8,11 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from recon_cli.datasets.app_frames import LeftOut
 from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
+from recon_cli.datasets.file_finder import shared_folders
 from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, find_images
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import Lens, make_lens
@@ -20,6 +22,9 @@ _PICTURES = frozenset(suffix.lower() for suffix in SUFFIXES)
 _FAR = 1e4
 _MOST_OFF = 0.25  # pixels by which a lens without r^8 may miss one that has it
 _FITS = 3.0  # points of the same world lie within so many times the extent of the cameras
+# Points of a model lie on surfaces, most of which a scan of the same world shows too: one of a
+# hundred points spread over them is this near, as a share of the extent. So many are asked.
+_NEAR, _ASKED = 0.1, 2000
 
 
 def list_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -41,23 +46,13 @@ def list_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
         fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
         if len(fitting) > 1:
-            shared = [_shared(path.parts, parts) for path in fitting]
+            shared = [shared_folders(path.parts[:-1], parts[:-1]) for path in fitting]
             best = max(shared)
             fitting = [path for path, count in zip(fitting, shared, strict=True) if count == best]
         if len(fitting) == 1:
             found[name] = fitting[0]
     taken = list(found.values())
     return {name: path for name, path in found.items() if taken.count(path) == 1}
-
-
-def _shared(path: Sequence[str], other: Sequence[str]) -> int:
-    """Returns how many folders two paths share at their ends."""
-    count = 0
-    for one, two in zip(reversed(path[:-1]), reversed(other[:-1]), strict=False):
-        if one.casefold() != two.casefold():
-            break
-        count += 1
-    return count
 
 
 def solved_set(
@@ -108,26 +103,52 @@ def find_points(posed: PosedSet, folder: Path) -> PosedSet:
     files = sorted(path for path in folder.glob("*.ply") if path.is_file())
     if posed.points is not None or not files:
         return posed
-    name = files[0].name
     if len(files) > 1:
         return _with_notice(posed, f"its {len(files)} .ply files are not read: one may be given")
+    return read_points(posed, files[0])
+
+
+def read_points(posed: PosedSet, path: Path) -> PosedSet:
+    """Returns the set with the points of a .ply, in place of its own; a notice if they do not fit.
+
+    Colours that it lacks are gray. Of very many points some are taken, evenly spread.
+    """
     # Late, for it imports torch, which nothing else here needs.
     from recon_cli.splats.ply import read_ply_points
 
     try:
-        points, colors = read_ply_points(files[0])
+        points, colors = read_ply_points(path)
     except (FormatError, InputError) as error:
-        return _with_notice(posed, f"{name} is not read: {error.message}")
-    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
-    middle = np.median(points, axis=0) if len(points) else np.full(3, np.inf)
-    extent = max(float(np.ptp(centers, axis=0).max()), float(np.ptp(np.percentile(
-        points, (5, 95), axis=0), axis=0).max()) if len(points) else 0.0)
-    if not np.linalg.norm(middle - np.median(centers, axis=0)) <= _FITS * extent:
-        return _with_notice(posed, f"{name} is not read: its points lie far from the cameras")
+        return _with_notice(posed, f"{path.name} is not read: {error.message}")
+    if not _fits(points, posed):
+        return _with_notice(posed, f"{path.name} is not read: its points lie far from the cameras, "
+                            "or from the set's own points")
     if colors is None:
         colors = np.full(points.shape, 128, np.uint8)
     rows = thin_points(points, MAX_POINTS)
-    return replace(posed, points=points[rows], colors=colors[rows])
+    count = f"{len(points)} points" + f", {len(rows)} of them, evenly spread" * (
+        len(rows) < len(points))
+    return _with_notice(
+        replace(posed, points=points[rows], colors=colors[rows]), f"{path.name} gives {count}")
+
+
+def _fits(points: NDArray[np.float64], posed: PosedSet) -> bool:
+    """Returns whether points may be of the world of a set, by its cameras and its own points."""
+    if not len(points):
+        return False
+    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
+    extent = max(float(np.ptp(centers, axis=0).max()), _extent(points))
+    if not np.linalg.norm(np.median(points - np.median(centers, axis=0), axis=0)) <= _FITS * extent:
+        return False
+    if posed.points is None or not len(posed.points):
+        return True
+    some = posed.points[::max(1, len(posed.points) // _ASKED)]
+    return bool(np.median(KDTree(points).query(some)[0]) <= _NEAR * extent)
+
+
+def _extent(points: NDArray[np.float64]) -> float:
+    """Returns the longest side of the box that holds most points."""
+    return float(np.ptp(np.percentile(points, (5, 95), axis=0), axis=0).max())
 
 
 def _with_notice(posed: PosedSet, text: str) -> PosedSet:

@@ -98,7 +98,7 @@ class FileFinder:
                      [_stem(last), _stem(f"{last}.")]):
             candidates = [parts for key in keys for parts in self._files.get(key, ())
                           if _kind(parts) == kind]
-            shared = [_shared_folders(parts[:-1], wanted[:-1]) for parts in candidates]
+            shared = [shared_folders(parts[:-1], wanted[:-1]) for parts in candidates]
             if candidates:
                 if shared.count(max(shared)) > 1:
                     return None
@@ -131,7 +131,7 @@ def _kind(parts: Sequence[str]) -> str:
     return next((kind for part in parts[:-1] if (kind := picture_kind(part))), "")
 
 
-def _shared_folders(folders: Sequence[str], others: Sequence[str]) -> int:
-    """Returns how many folders two paths share at their ends."""
+def shared_folders(folders: Sequence[str], others: Sequence[str]) -> int:
+    """Returns how many folders two paths share at their ends, in any case."""
     pairs = zip(reversed(folders), reversed(others), strict=False)
-    return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
+    return len(list(takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs)))

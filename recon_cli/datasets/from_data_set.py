@@ -26,7 +26,7 @@ from recon_cli.capture.photo_tree import describe_unused
 from recon_cli.capture.photos import make_frame_names
 from recon_cli.capture.video import stored_frames
 from recon_cli.config.stages import IngestConfig
-from recon_cli.datasets.depth_agreement import find_fault
+from recon_cli.datasets.depth_agreement import fit_depth
 from recon_cli.datasets.depth_points import points_from_depth
 from recon_cli.datasets.layouts import describe, read_posed
 from recon_cli.datasets.packed import is_packed, unpacked
@@ -102,13 +102,13 @@ def _ingest(
 
 def _choose_images(config: IngestConfig, posed: PosedSet, ctx: IngestContext) -> list[PosedImage]:
     """Returns the images to use, in order: evenly chosen ones where there are too many."""
-    held_out = [image for image in posed.images if image.held_out]
-    rest = [image for image in posed.images if not image.held_out]
+    rest = [image.name for image in posed.images if not image.held_out]
     most = config.frames or (config.max_frames if posed.sequence else len(rest))
     if len(rest) > most:
         ctx.notice(f"{most} of {len(rest)} frames are used, evenly spread; --frames changes that.")
         rest = [rest[int((i + 0.5) * len(rest) / most)] for i in range(most)]
-    return rest + held_out
+    chosen = set(rest)
+    return [image for image in posed.images if image.held_out or image.name in chosen]
 
 
 def _find_white(images: Sequence[PosedImage], ctx: IngestContext) -> int:
@@ -209,14 +209,10 @@ def _write_depth(
 ) -> PosedSet:
     """Writes the depth of frames that the set does not hold out, as the sensor gave it.
 
-    Returns the set without depth that is damaged, or that cannot be that of a room, which a notice
-    counts. FormatError if every file is damaged.
+    Returns the set with depth in the unit that fits its poses; without depth that is damaged, or
+    fits in none. FormatError if every file is damaged.
     """
-    fault = find_fault([image for _, image in readable if not image.held_out]) if (
-        _has_lidar(posed)) else ""
-    if fault:
-        ctx.notice(f"The depth is not used: it would fit the poses {fault}, but not as it is.")
-        return _without_depth(posed)
+    posed, readable = _fit_depth(posed, readable, ctx)
     maps, damaged, medians = {}, dict[str, FormatError](), []
     for name, image in readable:
         if image.depth is None or image.held_out:
@@ -236,11 +232,10 @@ def _write_depth(
         raise next(iter(damaged.values()))
     typical = float(np.nanmedian(medians)) if np.isfinite(medians).any() else 0.0
     low, high = _PLAUSIBLE
-    if _has_lidar(posed) and typical and not low <= typical <= high:
-        ctx.notice(
-            f"The depth is not used: it is {typical:.3g} m in the median of the frames, which is "
-            "not that of a room, so its unit is not the one that its program writes.")
-        return _without_depth(posed)
+    if posed.metric and typical and not low <= typical <= high:
+        return _without_depth(posed, ctx, (
+            f"it is {typical:.3g} m in the median of the frames, which is not that of a room, so "
+            "its unit is not the one that its program writes"))
     if damaged:
         first = next(iter(damaged.values()))
         ctx.notice(f"Depth is left out: {format_count(len(damaged), 'file')} cannot be read; "
@@ -251,7 +246,28 @@ def _write_depth(
         replace(image, depth=None) if image.name in damaged else image for image in posed.images))
 
 
-def _without_depth(posed: PosedSet) -> PosedSet:
+def _fit_depth(
+    posed: PosedSet, readable: Sequence[tuple[str, PosedImage]], ctx: IngestContext
+) -> tuple[PosedSet, Sequence[tuple[str, PosedImage]]]:
+    """Returns the set and its readable images with depth in the unit that fits the poses."""
+    fit = fit_depth([image for _, image in readable if not image.held_out], posed.points)
+    # Tracked poses may be refuted later, and depth then still shows the scale.
+    if fit.fault and not (fit.contradicts and posed.accuracy == "tracked"):
+        posed = _without_depth(posed, ctx, f"{fit.fault}, but not as it is")
+    elif fit.words:
+        ctx.notice(f"The depth fits the poses {fit.words}, and is used so.")
+    elif posed.metric_by_depth and not fit.shown:
+        ctx.notice("Nothing shows whether the depth fits the poses, so their unit is not taken for "
+                   "a metre; --scale-between of recon sfm makes it one.")
+    images = {image.name: replace(image, depth=image.depth and image.depth.scaled(fit.factor))
+              for image in posed.images}
+    posed = replace(posed, images=tuple(images.values()),
+                    metric=posed.metric and (fit.shown or not posed.metric_by_depth))
+    return posed, [(name, images[image.name]) for name, image in readable]
+
+
+def _without_depth(posed: PosedSet, ctx: IngestContext, reason: str) -> PosedSet:
+    ctx.notice(f"The depth is not used: {reason}.")
     return replace(posed, images=tuple(replace(image, depth=None) for image in posed.images))
 
 

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from recon_cli.datasets.depth_file import DepthFile
 from recon_cli.datasets.posed import (
@@ -26,8 +26,9 @@ from recon_cli.datasets.posed import (
     resolve_inside,
 )
 from recon_cli.datasets.rgbd import read_matrix, read_pose, tracked_sequence
+from recon_cli.datasets.trajectory import Trajectory
 from recon_cli.errors import FormatError, InputError
-from recon_cli.io.calibration import lens_from_matrix, viewmat_from_pose
+from recon_cli.io.calibration import lens_from_matrix
 from recon_cli.scene.camera import Lens, make_lens
 
 _COLOR = re.compile(r"frame-(\d+)\.color\.(?:png|jpg|jpeg)", re.IGNORECASE)
@@ -48,9 +49,7 @@ _TUM_CAMERAS = {
     "": (525.0, 525.0, 319.5, 239.5, 0.0, 0.0, 0.0, 0.0, 0.0),
 }
 _TUM_NAME = re.compile(r"(?:freiburg|fr)([123])(?![0-9])", re.IGNORECASE)
-# Seconds. The benchmark's own tool pairs depth with colours up to .02 apart; its motion capture
-# runs at 100 Hz, so that a longer gap means that it lost the camera.
-_DEPTH_APART, _POSES_APART = 0.02, 0.1
+_DEPTH_APART = 0.02  # seconds, within which the benchmark's own tool pairs depth with colours
 
 
 def is_seven_scenes(folder: Path) -> bool:
@@ -125,8 +124,8 @@ def _kinect(folder: Path, size: tuple[int, int]) -> tuple[Lens, Lens | None, tup
 def read_tum(folder: Path) -> PosedSet:
     """Returns a TUM RGB-D sequence without the frames that motion capture lost.
 
-    Poses are interpolated at the times of the frames. InputError if no frame has an image and a
-    pose; FormatError if a list is damaged or names files outside the folder.
+    Poses of the frames' own times are taken, others interpolated. InputError if no frame has an
+    image and a pose; FormatError if a list is damaged or names files outside the folder.
     """
     names, times = _read_list(folder, "rgb.txt")
     camera = _TUM_NAME.search(folder.absolute().name)
@@ -135,7 +134,8 @@ def read_tum(folder: Path) -> PosedSet:
     model, distortion = ("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)) if k1 else (
         "PINHOLE", ())
     lens = make_lens(model, *_KINECT_SIZE, (*inner, *distortion), str(folder))
-    viewmats = _interpolate_poses(folder / "groundtruth.txt", times)
+    path = _read_trajectory(folder / "groundtruth.txt")
+    viewmats = [path.viewmat(time) for time in times]
     depths = _pair_depth(folder, times)
     listed = [
         PosedImage(
@@ -185,26 +185,11 @@ def _read_list(folder: Path, name: str) -> tuple[list[str], NDArray[np.float64]]
     return [rows[at][1] for at in order], times[order]
 
 
-def _interpolate_poses(path: Path, times: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
-    """Returns [4, 4] world to camera at each time, None where the path has a gap or ends."""
+def _read_trajectory(path: Path) -> Trajectory:
     values = _numbers([row[:8] for row in _read_rows(path, 8)], path)
-    values = values[np.argsort(values[:, 0], kind="stable")] if len(values) else values
-    values = values[np.r_[True, np.diff(values[:, 0]) > 0]] if len(values) else values
     if len(values) < 2 or not np.linalg.norm(values[:, 4:8], axis=1).all():
         raise FormatError(f"{path} holds no path: needed are lines of time tx ty tz qx qy qz qw.")
-    known, turns = values[:, 0], Slerp(values[:, 0], Rotation.from_quat(values[:, 4:8]))
-    viewmats: list[NDArray[np.float64] | None] = []
-    for time in times:
-        after = int(np.clip(np.searchsorted(known, time), 1, len(known) - 1))
-        near = known[after - 1] <= time <= known[after]
-        if not near or known[after] - known[after - 1] > _POSES_APART:
-            viewmats.append(None)
-            continue
-        pose = np.eye(4)
-        pose[:3, :3] = turns(time).as_matrix()
-        pose[:3, 3] = [np.interp(time, known, values[:, 1 + axis]) for axis in range(3)]
-        viewmats.append(viewmat_from_pose(pose, f"{path}, at {time:.4f},"))
-    return viewmats
+    return Trajectory(values[:, 0], Rotation.from_quat(values[:, 4:8]), values[:, 1:4])
 
 
 def _pair_depth(folder: Path, times: NDArray[np.float64]) -> list[Path | None]:

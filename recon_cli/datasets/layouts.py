@@ -40,6 +40,7 @@ from recon_cli.datasets.rgbd import (
 )
 from recon_cli.datasets.rtabmap import is_rtabmap, read_rtabmap
 from recon_cli.datasets.scanner_app import is_scanner_app, read_scanner_app
+from recon_cli.datasets.split_lists import apply_lists
 from recon_cli.datasets.stray_scanner import is_stray, read_stray
 from recon_cli.datasets.transforms import is_transforms, read_transforms
 from recon_cli.errors import FormatError, InputError, format_count, list_names
@@ -139,7 +140,8 @@ def read_posed(path: Path) -> PosedSet:
         known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
         raise InputError(f"{path} is not a data set with poses.", hint=f"Known are {known}.")
     try:
-        return _attach_masks(layout.read(path), path if path.is_dir() else path.parent)
+        folder = path if path.is_dir() else path.parent
+        return _attach_masks(apply_lists(layout.read(path), folder), folder)
     except FormatError as error:
         if error.hint:
             raise
@@ -174,9 +176,9 @@ def _attach_masks(posed: PosedSet, folder: Path) -> PosedSet:
     bare = {image.name: PurePosixPath(image.name) for image in posed.images if image.mask is None}
     listed = {image.mask for image in posed.images}
     homes = dict.fromkeys([folder, *(
-        image.path.parents[len(PurePosixPath(image.name).parts)] for image in posed.images
+        image.path.parents[len(PurePosixPath(image.name).parts) - above] for image in posed.images
         if image.path.is_relative_to(folder) and len(image.path.relative_to(folder).parts)
-        > len(PurePosixPath(image.name).parts))])
+        > len(PurePosixPath(image.name).parts) for above in (0, 1))])
     found: dict[str, Path] = {}
     unused: list[str] = []
     for place in dict.fromkeys(place for home in homes for place in mask_folders(home)):

@@ -10,7 +10,7 @@ nerfstudio's issue 2294.)
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -39,6 +39,8 @@ _SKEW = 0.5  # pixels that leaving out b2 may move the border
 # On the earth's surface, from its centre: coordinates whose up is not z.
 _ECEF = (6.3e6, 6.4e6)  # metres
 
+_Component = tuple[int, str | None]  # number of the chunk, and id in it
+
 
 def is_metashape(path: Path) -> bool:
     """Returns whether a folder has such an .xml, or a file is one."""
@@ -59,8 +61,10 @@ def _find(path: Path) -> Path | None:
 @dataclass(frozen=True, eq=False)
 class _Camera:
     label: str
-    sensor: str
-    component: str | None
+    path: str  # the label below those of its chunk and groups, which folders may be called like
+    enabled: bool
+    sensor: ElementTree.Element | None
+    component: _Component
     transform: str | None
     where: str
 
@@ -69,33 +73,61 @@ def read_metashape(path: Path) -> PosedSet:
     """Returns the photos that are aligned; InputError if none is, FormatError if damaged."""
     file = _find(path)
     assert file is not None
-    chunk, folder = _read_chunk(file), file.parent
-    cameras = [
-        _Camera(node.get("label", ""), node.get("sensor_id", ""), node.get("component_id"),
-                node.findtext("transform"), f"{file}, camera {node.get('label')}")
-        for node in chunk.iterfind("cameras//camera")]
-    worlds = _read_worlds(chunk, file)
-    sensors = {node.get("id", ""): node for node in chunk.iterfind("sensors/sensor")}
-    left_out, listed, missing = LeftOut(), [], []
-    files = list_files(folder, [camera.label for camera in cameras])
-    apart = _unplaced_components(chunk, cameras)
-    for camera in cameras:
-        image = files.get(camera.label)
-        if camera.transform is None:
-            left_out.add(camera.label, "without a transform: not aligned, or second of a rig")
-        elif camera.component in apart:
-            left_out.add(camera.label, "of further components, which nothing places in one world")
-        elif image is None:
-            missing.append(camera.label)
-        elif (viewmat := left_out.pose(
-                camera.label, _pose, camera, worlds, opengl=False)) is not None:
-            lens = _sensor_lens(sensors.get(camera.sensor), camera, left_out)
-            if lens is not None:
-                listed.append(PosedImage(image.name, image, lens, viewmat))
-    scaled = any(world.scale != 1 for world in worlds.values())
-    posed = solved_set("metashape", listed, folder, left_out, missing=missing,
+    folder, cameras, worlds = file.parent, list[_Camera](), dict[_Component, Similarity | None]()
+    for at, chunk in enumerate(_read_chunks(file)):
+        found = _read_worlds(chunk, file)
+        cameras += _list_cameras(chunk, at, file, found)
+        worlds |= {(at, key): world for key, world in found.items()}
+    left_out, listed, missing = LeftOut(), list[PosedImage](), list[str]()
+    for aligned in _by_component(cameras, worlds, left_out):
+        files = list_files(folder, [camera.path for camera in aligned])
+        labels = Counter(camera.label for camera in aligned)
+        taken = {image.path for image in listed}
+        for camera in aligned:
+            image = files.get(camera.path)
+            if image in taken:
+                left_out.add(camera.label, "whose photo a larger chunk or component has, too")
+            elif image is None and labels[camera.label] > 1:
+                left_out.add(camera.label, "whose label other cameras have, too: no folder that is "
+                             "called like their chunk or group tells their photos apart")
+            elif image is None:
+                missing.append(camera.label)
+            elif (viewmat := left_out.pose(camera.label, _pose, camera, worlds.get(
+                    camera.component), opengl=False)) is not None:
+                lens = _sensor_lens(camera, left_out)
+                if lens is not None:
+                    listed.append(PosedImage(image.name, image, lens, viewmat))
+    listed.sort(key=lambda image: (image.name, image.path))
+    scaled = any(world is not None and world.scale != 1 for world in worlds.values())
+    posed = solved_set("metashape", listed, folder, left_out, missing=list(dict.fromkeys(missing)),
                        photos=quoted(folder))
     return _finish(posed, folder, scaled)
+
+
+def _list_cameras(
+    chunk: ElementTree.Element, number: int, file: Path,
+    worlds: Mapping[str | None, Similarity | None],
+) -> Iterator[_Camera]:
+    """Yields the cameras of a chunk, also those in groups; what is disabled disables all in it."""
+    sensors = {node.get("id", ""): node for node in chunk.iterfind("sensors/sensor")}
+
+    def walk(node: ElementTree.Element, names: list[str], enabled: bool) -> Iterator[_Camera]:
+        for inner in node:
+            on = enabled and inner.get("enabled", "true").lower() not in ("false", "0")
+            label = inner.get("label", "")
+            if inner.tag == "group":
+                yield from walk(inner, [*names, label], on)
+            elif inner.tag == "camera":
+                component = inner.get("component_id")
+                yield _Camera(
+                    label, "/".join([*names, label]), on, sensors.get(inner.get("sensor_id", "")),
+                    (number, component if component in worlds or len(worlds) > 1
+                     else next(iter(worlds))),
+                    inner.findtext("transform"), f"{file}, camera {label}")
+
+    on = chunk.get("enabled", "true").lower() not in ("false", "0")
+    for cameras in chunk.iterfind("cameras"):
+        yield from walk(cameras, [chunk.get("label", "")], on)
 
 
 def _finish(posed: PosedSet, folder: Path, scaled: bool) -> PosedSet:
@@ -112,36 +144,47 @@ def _finish(posed: PosedSet, folder: Path, scaled: bool) -> PosedSet:
     return replace(posed, metric=True, up=Z_UP)
 
 
-def _read_chunk(file: Path) -> ElementTree.Element:
+def _read_chunks(file: Path) -> list[ElementTree.Element]:
     try:
         text = read_text(file)
         if "<!ENTITY" in text or "<!DOCTYPE" in text:  # neither has a place in such a file
             raise ValueError("it defines entities")
-        chunk = ElementTree.fromstring(text).find("chunk")
+        chunks = ElementTree.fromstring(text).findall("chunk")
     except (OSError, ValueError, ElementTree.ParseError) as error:
         raise FormatError(f"{file} cannot be read as XML: {error}.", hint=_HINT) from error
-    if chunk is None:
+    if not chunks:
         raise FormatError(f"{file} holds no chunk.", hint=_HINT)
-    return chunk
+    return chunks
 
 
-def _read_worlds(chunk: ElementTree.Element, file: Path) -> dict[str | None, Similarity]:
+def _read_worlds(chunk: ElementTree.Element, file: Path) -> dict[str | None, Similarity | None]:
     """Returns what takes each component to the world; old files have one for the whole chunk."""
-    common = _component(chunk, file)
-    return {node.get("id"): _component(node, file) if node.find("transform") is not None else common
+    common = _similarity(chunk, file)
+    return {node.get("id"): _similarity(node, file) or common
             for node in chunk.iterfind("components/component")} or {None: common}
 
 
-def _unplaced_components(
-    chunk: ElementTree.Element, cameras: Sequence[_Camera]
-) -> set[str | None]:
-    """Returns all components but the largest, if one of them has no transform to the world."""
-    counts = Counter(camera.component for camera in cameras if camera.transform is not None)
-    placed = {node.get("id") for node in chunk.iterfind("components/component")
-              if node.find("transform") is not None}
-    if len(counts) < 2 or set(counts) <= placed:
-        return set()
-    return set(counts) - {counts.most_common(1)[0][0]}
+def _by_component(
+    cameras: Sequence[_Camera], worlds: Mapping[_Component, Similarity | None], left_out: LeftOut
+) -> list[list[_Camera]]:
+    """Returns the cameras that are aligned and enabled, those of the largest component first.
+
+    That is all there is if one of the components has no transform to the world.
+    """
+    groups: dict[_Component, list[_Camera]] = {}
+    for camera in cameras:
+        if not camera.enabled:
+            left_out.add(camera.label, "that Metashape has disabled")
+        elif camera.transform is None:
+            left_out.add(camera.label, "without a transform: not aligned, or second of a rig")
+        else:
+            groups.setdefault(camera.component, []).append(camera)
+    ordered = sorted(groups.values(), key=len, reverse=True)
+    if all(worlds.get(component) for component in groups):
+        return ordered
+    for camera in (camera for group in ordered[1:] for camera in group):
+        left_out.add(camera.label, "of further components, which nothing places in one world")
+    return ordered[:1]
 
 
 def _numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
@@ -154,11 +197,11 @@ def _numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
     return values
 
 
-def _component(node: ElementTree.Element, file: Path) -> Similarity:
-    """Returns what takes the chunk to the world."""
+def _similarity(node: ElementTree.Element, file: Path) -> Similarity | None:
+    """Returns what takes a chunk or component to the world, None where it does not say."""
     found = node.find("transform")
     if found is None:
-        return Similarity()
+        return None
     where = f"{file}, the transform of {node.tag} {node.get('id', '')},"
     rotation, shift, scale = (found.findtext(key) for key in ("rotation", "translation", "scale"))
     matrix = np.eye(3) if rotation is None else _numbers(rotation, 9, where).reshape(3, 3)
@@ -173,30 +216,27 @@ def _component(node: ElementTree.Element, file: Path) -> Similarity:
         raise FormatError(f"{where} cannot be used: {error}.", hint=_HINT) from error
 
 
-def _pose(camera: _Camera, worlds: Mapping[str | None, Similarity]) -> NDArray[np.float64]:
+def _pose(camera: _Camera, world: Similarity | None) -> NDArray[np.float64]:
     """Returns camera to world [4, 4]."""
     inner = _numbers(camera.transform, 16, camera.where).reshape(4, 4)
-    world = worlds.get(camera.component) or (
-        next(iter(worlds.values())) if len(worlds) == 1 else Similarity())
+    world = world or Similarity()
     pose = np.eye(4)
     pose[:3, :3] = world.rotation @ inner[:3, :3]
     pose[:3, 3] = world.points(inner[:3, 3])
     return pose
 
 
-def _sensor_lens(
-    sensor: ElementTree.Element | None, camera: _Camera, left_out: LeftOut
-) -> Lens | None:
+def _sensor_lens(camera: _Camera, left_out: LeftOut) -> Lens | None:
     """Returns the lens of a sensor, None where COLMAP has none like it."""
-    if sensor is None:
+    if camera.sensor is None:
         left_out.add(camera.label, "of a sensor that the file lacks")
         return None
-    kind = sensor.get("type", "frame")
+    kind = camera.sensor.get("type", "frame")
     if kind not in ("frame", "fisheye", "equidistant_fisheye"):
         left_out.add(camera.label, f"of a {kind} sensor, which is not read")
         return None
     try:
-        return _make_lens(sensor, kind, camera.where)
+        return _make_lens(camera.sensor, kind, camera.where)
     except FormatError as error:
         left_out.add(camera.label, f"whose intrinsics cannot be used ({error.message})")
         return None

@@ -44,7 +44,7 @@ def read_nerfcapture(path: Path) -> PosedSet:
             f"{folder} has no frame that can be used: {'; '.join(left_out.notices())}.", hint=hint)
     return replace(
         posed, layout="nerfcapture", images=tuple(sorted(images, key=_order)), metric=True,
-        sequence=True, up=Y_UP, accuracy="tracked",
+        metric_by_depth=False, sequence=True, up=Y_UP, accuracy="tracked",
         notices=(*left_out.notices(), *posed.notices))
 
 

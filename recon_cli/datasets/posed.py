@@ -59,6 +59,8 @@ class PosedSet:
     images: tuple[PosedImage, ...]  # in the order of the data set
     missing: tuple[str, ...] = ()  # names of images that it lists, but whose files do not exist
     metric: bool = False  # its unit is the metre
+    # Nothing but its depth, which is in metres, says so: it holds only if that fits the poses.
+    metric_by_depth: bool = False
     # Up [3], a unit vector in its world, where the program that wrote it knows.
     up: tuple[float, float, float] | None = None
     # Where up is None: its axes are arbitrary, so that up is to be found from the scene. Else the

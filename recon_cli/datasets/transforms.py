@@ -29,6 +29,7 @@ from recon_cli.datasets.posed import (
     is_file,
     resolve_inside,
 )
+from recon_cli.datasets.split_lists import PARTS, match_parts, split_parts
 from recon_cli.errors import FormatError, InputError, format_count
 from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
 from recon_cli.scene.camera import Camera, Lens, make_lens
@@ -40,7 +41,6 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # COLMAP's order in FULL_OPENCV
 _LARGEST = sys.float_info.max
 _FILE = "transforms.json"
-_PARTS = ("train", "val", "test")
 _DEPTH_UNIT = 1e-3  # nerfstudio's default: depth in millimetres
 _HINT = "Export it again from the program that it came from."
 
@@ -146,31 +146,32 @@ def read_transforms(path: Path) -> PosedSet:
     literature scores it; if it names validation views alone, those are held out. InputError if no
     image exists; FormatError if a file is damaged or a frame incomplete.
     """
-    frames: list[_Frame] = []
+    frames, notices = list[_Frame](), list[str]()
     lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
     finder = FileFinder(path.parent if path.is_file() else path, [
         entry[key] for _, _, (_, entries) in lists for entry in entries
         for key in ("file_path", "depth_file_path", "depth_path", "mask_path") if key in entry])
     for file, part, (common, entries) in lists:
-        frames += _list_entries(file, part, common, entries, finder)
-    frames, notices = _drop_duplicates(frames)
-    held_out = "test" if "test" in {frame.part for frame in frames} else "val"
-    used = [frame for frame in frames if frame.part in (None, "train", held_out)]
-    left_out = len(frames) - len(used)
-    if left_out:
-        notices.append(f"{left_out} frames are left out: the set keeps them for validation, or "
-                       "lists them in no part")
+        found, told = _list_entries(file, part, common, entries, finder)
+        frames += found
+        notices += told
+    frames, copies = _drop_duplicates(frames)
+    notices += copies
+    keep, held_out, split = split_parts([frame.part for frame in frames], path.name)
+    notices += split
+    used = [(frame, held) for frame, kept, held in zip(frames, keep, held_out, strict=True) if kept]
     listed, missing = [], []
-    for frame, name in zip(used, _short_names(used), strict=True):
+    for (frame, held), name in zip(used, _short_names([one for one, _ in used]), strict=True):
         if is_file(frame.path):
-            listed.append(_list_frame(frame, name, held_out, finder))
+            listed.append(_list_frame(frame, name, held, finder))
         else:
             missing.append(name)
     posed = find_images("transforms", listed, path, missing=missing)
     points, colors, point_notices = _read_points(path if path.is_file() else path / _FILE)
-    notices += [*finder.notices(), *_describe_unread(used, listed)]
+    notices += [*finder.notices(), *_describe_unread([frame for frame, _ in used], listed)]
+    depth = any(image.depth is not None for image in posed.images)
     return replace(
-        posed, metric=any(image.depth is not None for image in posed.images),
+        posed, metric=depth, metric_by_depth=depth,
         splits=any(image.held_out for image in posed.images), points=points, colors=colors,
         notices=(*notices, *posed.notices, *point_notices))
 
@@ -187,7 +188,7 @@ def list_cameras(path: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
         if "file_path" in entry])
     frames, _ = _drop_duplicates([
         frame for file, part, (common, entries) in lists
-        for frame in _list_entries(file, part, common, entries, finder)])
+        for frame in _list_entries(file, part, common, entries, finder)[0]])
     return [(name, _stated_lens(frame), _viewmat(frame))
             for frame, name in zip(frames, _short_names(frames), strict=True)]
 
@@ -227,7 +228,7 @@ def _files(path: Path) -> list[tuple[Path, str | None]]:
         return [(path, None)]
     if (path / _FILE).is_file():
         return [(path / _FILE, None)]
-    files = [(path / f"transforms_{part}.json", part) for part in _PARTS]
+    files = [(path / f"transforms_{part}.json", part) for part in PARTS]
     return [(file, part) for file, part in files if file.is_file()]
 
 
@@ -237,48 +238,44 @@ def _read_entries(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     entries = value.get("frames") if isinstance(value, dict) else None
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{file} lists no frames.", hint=_HINT)
+    tests = value.get("test_frames")  # ScanNet++'s
+    entries = [*entries, *(tests if isinstance(tests, list) else ())]
     for at, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise FormatError(f"{file}, frame {at}, is not an object.", hint=_HINT)
-    return {key: item for key, item in value.items() if key != "frames"}, entries
+    if tests and isinstance(tests, list):
+        value["test_filenames"] = [entry.get("file_path") for entry in tests]
+    return {key: item for key, item in value.items() if not key.endswith("frames")}, entries
 
 
 def _list_entries(
     file: Path, part: str | None, common: dict[str, Any], entries: Sequence[dict[str, Any]],
     finder: FileFinder,
-) -> list[_Frame]:
-    parts = _read_parts(common, file)
+) -> tuple[list[_Frame], list[str]]:
+    """Returns the frames of a file, and notices about the names in its lists."""
+    parts, notices = _read_parts(common, part, entries, file)
     frames = []
-    for at, entry in enumerate(entries):
+    for at, (entry, own) in enumerate(zip(entries, parts, strict=True)):
         text = entry.get("file_path")
         path = finder.find(text, f"{file}, frame {at},")
-        own = part if parts is None else parts.get(_plain(text), "")
         frames.append(_Frame({**common, **entry}, f"{file}, frame {text},", file.parent, path, own))
-    return frames
+    return frames, notices
 
 
-def _read_parts(shared: Mapping[str, Any], file: Path) -> dict[str, str] | None:
-    """Returns the part of each file name that nerfstudio's lists give, None without lists.
-
-    A name in several lists belongs to the last of train, val and test: what is scored is not
-    trained on. Without a list of training views every other frame is one.
-    """
-    lists = {part: shared.get(f"{part}_filenames") for part in _PARTS}
-    if all(names is None for names in lists.values()):
-        return None
-    parts: dict[str, str] = {}
-    if lists["train"] is None:
-        raise FormatError(
-            f"{file} has val_filenames or test_filenames, but no train_filenames.", hint=_HINT)
-    for part, names in lists.items():
+def _read_parts(
+    shared: Mapping[str, Any], part: str | None, entries: Sequence[dict[str, Any]], file: Path
+) -> tuple[Sequence[str | None], list[str]]:
+    """Returns the part of each entry: that of nerfstudio's lists, or the one of the whole file."""
+    lists = {}
+    for kind in PARTS:
+        names = shared.get(f"{kind}_filenames")
         if names is not None and not isinstance(names, list):
-            raise FormatError(f"{file}: {part}_filenames is not a list.", hint=_HINT)
-        parts.update({_plain(name): part for name in names or ()})
-    return parts
-
-
-def _plain(name: object) -> str:
-    return PurePosixPath(str(name)).as_posix()
+            raise FormatError(f"{file}: {kind}_filenames is not a list.", hint=_HINT)
+        if names is not None:
+            lists[kind] = names
+    if not lists:
+        return [part] * len(entries), []
+    return match_parts(lists, [str(entry.get("file_path")) for entry in entries], file.name)
 
 
 def _drop_duplicates(frames: Sequence[_Frame]) -> tuple[list[_Frame], list[str]]:
@@ -305,7 +302,7 @@ def _drop_duplicates(frames: Sequence[_Frame]) -> tuple[list[_Frame], list[str]]
 
 
 def _rank(part: str | None) -> int:
-    return _PARTS.index(part) if part in _PARTS else -1
+    return PARTS.index(part) if part in PARTS else -1
 
 
 def _short_names(frames: Sequence[_Frame]) -> list[str]:
@@ -319,11 +316,11 @@ def _short_names(frames: Sequence[_Frame]) -> list[str]:
     return ["/".join(path[shared:]) for path in parts]
 
 
-def _list_frame(frame: _Frame, name: str, held_out: str, finder: FileFinder) -> PosedImage:
+def _list_frame(frame: _Frame, name: str, held_out: bool, finder: FileFinder) -> PosedImage:
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
     time = frame.entry.get("timestamp")
     return PosedImage(
-        name, frame.path, lens, _viewmat(frame), frame.part == held_out,
+        name, frame.path, lens, _viewmat(frame), held_out,
         _find_depth(frame, lens, finder), _beside(frame, "mask_path", finder),
         time=float(time) if isinstance(time, (int, float)) else None)
 

@@ -4,6 +4,9 @@ import posed_sets
 import pytest
 
 from recon_cli.capture.mask_files import mask_folders, match_masks
+from recon_cli.capture.masks import find_masks
+from recon_cli.capture.photo_tree import find_photo_files
+from recon_cli.capture.photos import list_photos
 from recon_cli.datasets.layouts import read_posed
 
 
@@ -65,3 +68,21 @@ def test_where_no_mask_fits_the_right_name_is_told(tmp_path):
     touch(tmp_path / "masks" / "mask_0.png")
     assert any("0000.png must be called 0000.png.png or 0000.png" in notice
                for notice in read_posed(tmp_path).notices)
+
+
+@pytest.mark.parametrize("name", [".mask/{}.png", "{}.jpg.mask.png", "{}.MASK.PNG"])
+def test_the_mask_layers_of_realityscan_are_masks_and_no_photos(tmp_path, name):
+    for number in range(3):
+        posed_sets.write_image(tmp_path / f"p{number}.jpg")
+    posed_sets.write_image(tmp_path / name.format("p1"))
+    tree = find_photo_files(tmp_path)
+    assert [path.name for path in tree.files] == ["p0.jpg", "p1.jpg", "p2.jpg"]
+    found = find_masks(tmp_path, tree.home, list_photos(tree.files, tree.home).photos)
+    assert found.by_photo == {"p1.jpg": tmp_path / name.format("p1")}
+    assert not found.unused
+
+
+def test_masks_beside_the_images_of_a_data_set_are_read(tmp_path):
+    posed_sets.make_transforms(tmp_path)
+    posed_sets.write_image(tmp_path / "images" / "0001.png.mask.png")
+    assert [image.path.stem for image in read_posed(tmp_path).images if image.mask] == ["0001"]

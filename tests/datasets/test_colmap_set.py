@@ -265,3 +265,51 @@ def test_a_count_of_thousands_of_digits_is_more_than_the_file_holds(tmp_path):
     path.write_text(path.read_text().replace("images: 2", f"images: {'9' * 5000}"))
     with pytest.raises(FormatError, match="ends after 2"):
         read_colmap(tmp_path)
+
+
+def scan(folder, points, *, colors=True):
+    """Writes points3D.ply beside a model, as INRIA's trainer reads it."""
+    rows = np.zeros(len(points), [*((axis, "<f4") for axis in "xyz"), *(
+        (name, "u1") for name in ("red", "green", "blue") if colors)])
+    for axis, values in zip("xyz", np.transpose(points), strict=True):
+        rows[axis] = values
+    names = {"f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *(
+        f"property {names[kind[1:]]} {name}" for name, kind in rows.dtype.descr), "end_header", ""]
+    (folder / "sparse" / "0" / "points3D.ply").write_bytes(
+        "\n".join(header).encode() + rows.tobytes())
+
+
+def surface():
+    return np.random.default_rng(0).uniform((-1, 1, 4), (2, 3, 6), (500, 3))
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_cloud_beside_the_model_takes_the_place_of_its_points(folder, form, alone):
+    scan(folder, surface())
+    if alone:
+        (folder / "sparse" / "0" / f"points3D.{form}").unlink()
+    posed = read_colmap(folder)
+    np.testing.assert_allclose(posed.points, surface(), atol=1e-6)
+    assert posed.colors.shape == (500, 3)
+    assert any("points3D.ply" in notice and "500" in notice for notice in posed.notices)
+
+
+def test_points_of_a_cloud_without_colours_are_gray(folder):
+    scan(folder, surface(), colors=False)
+    assert (read_colmap(folder).colors == 128).all()
+
+
+@pytest.mark.parametrize("move", [1000.0, 40.0])
+def test_a_cloud_of_another_world_is_told_and_not_used(folder, move):
+    scan(folder, surface() + move)
+    posed = read_colmap(folder)
+    assert len(posed.points) == 2
+    assert any("points3D.ply is not read" in notice for notice in posed.notices)
+
+
+def test_a_damaged_cloud_is_told_and_not_used(folder):
+    (folder / "sparse" / "0" / "points3D.ply").write_bytes(b"ply\nno header")
+    posed = read_colmap(folder)
+    assert len(posed.points) == 2
+    assert any("points3D.ply is not read" in notice for notice in posed.notices)

@@ -1,12 +1,13 @@
-"""Depth that does not fit the poses is named by what would make it fit."""
+"""Depth is used in the unit that fits the poses, and named where none does."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 from app_shots import shots
 
-from recon_cli.datasets.depth_agreement import find_fault
+from recon_cli.datasets.depth_agreement import fit_depth
 from recon_cli.datasets.layouts import read_posed
 from recon_cli.datasets.posed import PosedImage
 from recon_cli.errors import FormatError
@@ -19,6 +20,7 @@ class Depth:
 
     values: np.ndarray | None
     lens: Lens
+    unit: float = 1e-3
 
     def read(self):
         if self.values is None:
@@ -37,23 +39,61 @@ def taken(request, shared_data):
     return shots(shared_data / "rooms" / request.param, count=20, step=5, factor=2)
 
 
-def posed(taken, change):
+def posed(taken, change, unit=1e-3, noise=0.01):
     rng = np.random.default_rng(0)
     lenses = [Lens("PINHOLE", *shot.size, shot.inner) for shot in taken]
     return [PosedImage(
         str(shot.number), None, lens, np.linalg.inv(shot.c2w), depth=Depth(
-            change(shot.depth * rng.normal(1, 0.01, shot.depth.shape)), lens))
+            change(shot.depth * rng.normal(1, noise, shot.depth.shape)), lens, unit))
         for shot, lens in zip(taken, lenses, strict=True)]
 
 
+@pytest.mark.parametrize(("own", "read"), [
+    (1.0, 1e-3), (1 / 5000, 1e-3), (1 / 4000, 1e-3), (1 / 6553.5, 1e-3), (1e-3, 1.0),
+    (1e-3, 1 / 5000), (1 / 4000, 1 / 5000), (1 / 5000, 1 / 6553.5), (1e-4, 1e-3)])
+def test_depth_in_another_unit_is_used_in_the_one_that_fits(taken, own, read):
+    fit = fit_depth(posed(taken, lambda metres: metres / own * read, read))
+    assert fit.factor == pytest.approx(own / read)
+    assert fit.shown
+    assert fit.words
+    assert not fit.fault
+
+
+@pytest.mark.parametrize(("scale", "noise"), [(1, 0.01), (1.05, 0.01), (0.95, 0.01), (1, 0.08)])
+def test_depth_that_fits_by_a_tenth_stays_as_it_is(taken, scale, noise):
+    fit = fit_depth(posed(taken, lambda depth: depth * scale, noise=noise))
+    assert (fit.factor, fit.shown, fit.fault, fit.words) == (1, True, "", "")
+
+
+@pytest.mark.parametrize("off", [1.2, 0.5, 39.37, 10, 0.02])
+def test_depth_in_no_usual_unit_is_not_used_and_the_factor_named(taken, off):
+    fit = fit_depth(posed(taken, lambda depth: depth / off))
+    assert (fit.factor, fit.shown, fit.contradicts) == (1, False, False)
+    said = float(re.search(r"about ([\d.e+-]+) times", fit.fault)[1])
+    assert said == pytest.approx(off, rel=0.1)
+
+
 @pytest.mark.parametrize(("change", "words"), [
-    (lambda depth: depth, ""), (lambda depth: 1.03 * depth, ""),
-    (lambda depth: depth / 10, "about 10 times"), (lambda depth: depth / 1000, "about 1e+03 times"),
-    (lambda depth: depth * 10, "about 0.1 times"), (lambda depth: depth[::-1], "upside down"),
+    (lambda depth: depth[::-1], "upside down"),
     (lambda depth: depth[:, ::-1], "left and right swapped")])
-def test_units_and_orders_of_rows_are_told_apart(taken, change, words):
-    found = find_fault(posed(taken, change))
-    assert found == words or (words and words in found)
+def test_depth_whose_rows_or_columns_are_in_another_order_is_not_used(taken, change, words):
+    fit = fit_depth(posed(taken, change))
+    assert not fit.shown
+    assert words in fit.fault
+
+
+def test_points_of_the_set_tell_the_unit_where_cameras_do_not_move(taken):
+    images = posed(taken, lambda depth: depth * 5)
+    one = images[0]
+    rows, columns = (axis.ravel() for axis in np.mgrid[2:40:3, 2:70:3])
+    fx, fy, cx, cy = one.depth.own_lens(*one.depth.values.shape[::-1]).params
+    z = taken[0].depth[rows, columns]
+    local = np.column_stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z])
+    points = (local - one.viewmat[:3, 3]) @ one.viewmat[:3, :3]
+    still = [dataclasses.replace(image, viewmat=one.viewmat, depth=one.depth)
+             for image in images[:4]]
+    assert fit_depth(still, points).factor == pytest.approx(0.2)
+    assert not fit_depth(still).shown
 
 
 def test_depth_that_fits_better_the_farther_it_is_is_not_accused(taken):
@@ -62,27 +102,30 @@ def test_depth_that_fits_better_the_farther_it_is_is_not_accused(taken):
         rows, columns = np.mgrid[:depth.shape[0], :depth.shape[1]]
         return 2 / np.sqrt(1 + ((columns * 4 - 148) / 150)**2 + ((rows * 4 - 83) / 150)**2)
 
-    assert find_fault(posed(taken, on_a_sphere)) == ""
+    assert not fit_depth(posed(taken, on_a_sphere)).shown
 
 
-def test_poses_of_another_walk_accuse_no_depth(taken):
+def test_poses_of_another_walk_are_told_from_a_wrong_unit(taken):
     images = posed(taken, lambda depth: depth)
     rng = np.random.default_rng(1)
     order = rng.permutation(len(images))
     mixed = [dataclasses.replace(image, viewmat=images[other].viewmat)
              for image, other in zip(images, order, strict=True)]
-    assert find_fault(mixed) == ""
+    fit = fit_depth(mixed)
+    assert not fit.shown
+    assert fit.factor == 1
+    assert fit.contradicts or not fit.fault
 
 
 def test_without_motion_or_readable_depth_nothing_is_said(taken):
     images = posed(taken, lambda depth: depth / 10)
     still = [dataclasses.replace(image, viewmat=images[0].viewmat) for image in images]
-    assert find_fault(still) == ""
-    assert find_fault([dataclasses.replace(image, depth=Depth(None, image.lens))
-                       for image in images]) == ""
-    assert find_fault(images[:1]) == ""
-    assert find_fault([]) == ""
+    damaged = [dataclasses.replace(image, depth=Depth(None, image.lens)) for image in images]
+    for some in (still, damaged, images[:1], []):
+        fit = fit_depth(some)
+        assert (fit.factor, fit.shown, fit.fault) == (1, False, "")
 
 
-def test_depth_of_a_real_phone_fits(shared_data):
-    assert find_fault(read_posed(shared_data / "record3d_door").images) == ""
+def test_depth_of_a_real_phone_is_used_as_it_is(shared_data):
+    fit = fit_depth(read_posed(shared_data / "record3d_door").images)
+    assert (fit.factor, fit.fault) == (1, "")

@@ -125,3 +125,51 @@ def test_damaged_lists_are_refused(tmp_path, name, text, message):
     (folder / name).write_text(text)
     with pytest.raises(FormatError, match=message):
         read_tum(folder)
+
+
+def write_path(folder, times, places):
+    """Writes groundtruth.txt with the poses of some places of the walk."""
+    lines = []
+    for time, place in zip(times, places, strict=True):
+        half = 0.05 * place / 2  # as in `posed_sets.pose`
+        lines.append(f"{time:.4f} {0.1 * place} 0.05 -0.2 0 {np.sin(half)} 0 {np.cos(half)}\n")
+    (folder / "groundtruth.txt").write_text("".join(lines))
+
+
+@pytest.mark.parametrize("apart", [2.0, 0.5, 0.1, 0.03])
+def test_a_pose_of_a_frames_own_time_counts_however_far_others_are(tmp_path, apart):
+    folder = posed_sets.make_tum(tmp_path, frames=5)
+    times = 1e9 + apart * np.arange(5)
+    (folder / "rgb.txt").write_text("".join(
+        f"{time:.6f} rgb/{n}.png\n" for n, time in enumerate(times)))
+    (folder / "depth.txt").unlink()
+    write_path(folder, times + 0.0004, range(5))  # as rounded elsewhere
+    posed = read_tum(folder)
+    assert len(posed.images) == 5
+    for number, image in enumerate(posed.images):
+        np.testing.assert_allclose(
+            image.viewmat @ posed_sets.pose(number), np.eye(4), atol=1e-6)
+
+
+@pytest.mark.parametrize(("interval", "count"), [(0.02, 9), (0.1, 9), (0.2, 9), (1.0, 4)])
+def test_between_poses_the_usual_interval_tells_a_gap(tmp_path, interval, count):
+    """Frames lie in the middle between poses; five intervals of them are missing before the 5th.
+
+    Over a second a hand moves too freely to be interpolated: one frame a pose is left.
+    """
+    folder = posed_sets.make_tum(tmp_path, frames=10)
+    (folder / "depth.txt").unlink()
+    steps = np.arange(10.0)
+    steps[5:] += 12
+    frames = (steps[:-1] + 0.5)
+    frames[4] = steps[4] + 6
+    frames = np.append(frames, steps[-1])
+    if interval == 1.0:
+        frames[:3] = steps[:3]
+    (folder / "rgb.txt").write_text("".join(
+        f"{10 + interval * step:.6f} rgb/{n}.png\n" for n, step in enumerate(frames)))
+    write_path(folder, 10 + interval * steps, steps)
+    posed = read_tum(folder)
+    assert len(posed.images) == count
+    assert "4.png" not in [image.name for image in posed.images]
+    assert any(f"{10 - count} frames" in notice for notice in posed.notices)

@@ -1,6 +1,7 @@
 """Versions of photogrammetry exports: every one gives the same cameras; see `plain_captures`."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from plain_captures import (
 )
 
 from recon_cli.datasets.layouts import read_posed, recognise
+from recon_cli.errors import InputError
 
 
 def angles(pose):
@@ -118,6 +120,66 @@ def test_components_that_nothing_places_are_left_out(tmp_path):
     posed = read_posed(tmp_path)
     assert len(posed.images) == COUNT - 1
     assert any("1 frame of further components" in notice for notice in posed.notices)
+
+
+@pytest.mark.parametrize("value", ["false", "False", "0"])
+@pytest.mark.parametrize("group", ["", '<group label="g">', '<group label="g" enabled="{}">'])
+def test_cameras_that_metashape_has_disabled_are_left_out_and_counted(tmp_path, value, group):
+    metashape(tmp_path)
+    path, off = tmp_path / "c.xml", f'enabled="{value}"'
+    whole = "enabled" in group
+    made = path.read_text().replace("<cameras>", "<cameras>" + group.format("true"))
+    made = made.replace("</cameras>", "</group></cameras>" * bool(group) + "</cameras>" * (
+        not group))
+    if whole:  # all but those of the first group
+        made = made.replace('<camera id="2"', f'</group><group label="h" {off}><camera id="2"')
+    else:
+        made = made.replace('<camera id="1"', f'<camera {off} id="1"')
+    path.write_text(made)
+    posed = read_posed(tmp_path)
+    assert len(posed.images) == (2 if whole else COUNT - 1)
+    assert any(f"{COUNT - len(posed.images)} frame" in notice and "disabled" in notice
+               for notice in posed.notices)
+
+
+def twice(folder, names, *, placed=True, labels=("left", "right")):
+    """Writes one photo set in two folders, and two chunks whose cameras are labelled alike."""
+    metashape(folder)
+    text_ = (folder / "c.xml").read_text()
+    for at in range(COUNT):
+        image = folder / "img" / f"IMG {at}.JPG"
+        for name in names:
+            picture(folder / name / image.name, seed=at)
+        text_ = text_.replace(rf"C:\img\IMG {at}.JPG", f"IMG {at}").replace(
+            f'"IMG {at}.JPG"', f'"IMG {at}"')
+        image.unlink()
+    head, _, rest = text_.partition("<chunk")
+    chunk = "<chunk" + rest.partition("</document>")[0]
+    second = chunk if placed else re.sub(r"<component .*?</component>", '<component id="0"/>', chunk)
+    (folder / "c.xml").write_text(
+        head + chunk.replace('label="a"', f'label="{labels[0]}"')
+        + second.replace('label="a"', f'label="{labels[1]}"') + "</document>")
+
+
+def test_equal_labels_of_two_chunks_are_told_apart_by_folders_of_their_names(tmp_path):
+    twice(tmp_path, ("left", "right"))
+    posed = read_posed(tmp_path)
+    assert len(posed.images) == 2 * COUNT
+    assert {image.path.parent.name for image in posed.images} == {"left", "right"}
+
+
+def test_equal_labels_that_nothing_tells_apart_are_left_out_and_said(tmp_path):
+    twice(tmp_path, ("one", "two"))
+    with pytest.raises(InputError, match="label other cameras have"):
+        read_posed(tmp_path)
+
+
+@pytest.mark.parametrize("placed", [True, False])
+def test_a_photo_in_two_chunks_is_used_once(tmp_path, placed):
+    twice(tmp_path, ("photos",), placed=placed)
+    posed = read_posed(tmp_path)
+    assert len(posed.images) == COUNT
+    assert any(f"{COUNT} frames" in notice for notice in posed.notices)
 
 
 def test_bundler_llff_and_opensfm(tmp_path):
