@@ -34,6 +34,8 @@ from recon_cli.splats.axes import AXES, PLY, Z_UP, nearest_up, turn_from, up_of
 from recon_cli.splats.foreign import warn_of_degree
 from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
+    HARMLESS_BYTES,
+    MAX_RATIO,
     Bytes,
     Floats,
     decode_opacities,
@@ -78,8 +80,6 @@ _ANTIALIASED = 1
 # Coefficients a channel that a file may have; those above degree 3 are cut off.
 _FILE_TERMS = (*TERMS, 24)
 _MAX_FRACTIONAL_BITS = 24
-# Limits of the unpacked size. A scene whose harmonics are all 0 reaches 5 times its size.
-_HARMLESS_BYTES, _MAX_RATIO = 1 << 24, 128
 _ZSTD_LEVEL = 12  # that of Niantic's program
 
 
@@ -286,7 +286,7 @@ def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
         raise FormatError(f"{path} has positions of {bits} fractional bits, above 24: damaged.")
     header = SpzHeader(
         version, count, degree, bits, antialiased=bool(flags & _ANTIALIASED))
-    if not count or sum(header.sizes) > _HARMLESS_BYTES + _MAX_RATIO * size:
+    if not count or sum(header.sizes) > HARMLESS_BYTES + MAX_RATIO * size:
         raise FormatError(
             f"{path} promises {count} Gaussians, which do not fit into its {size} bytes.",
             hint="Copy the file again, or export it again from its source.")

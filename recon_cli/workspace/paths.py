@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from recon_cli.errors import FormatError
 
@@ -21,6 +21,12 @@ def is_plain_file(path: Path) -> bool:
         return stat.S_ISREG(os.lstat(path).st_mode)
     except OSError:
         return False
+
+
+def leads_out(name: str) -> bool:
+    """Returns whether a path in an archive or index would lead out of the folder it belongs in."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name
 
 
 def refuse_special(path: Path) -> None:
