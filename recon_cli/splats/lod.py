@@ -10,6 +10,7 @@ together with files that splat-transform writes and reads.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -272,7 +273,7 @@ class _Index(UntrustedFile):
         """Returns the meta.json of files of Gaussians, and of the environment as the last."""
         places = [self._path(self.names[number]) for number in numbers]
         places += [self.environment] if self.environment else []
-        if len({place.resolve() for place in places}) < len(places):
+        if len(set(map(os.path.realpath, places))) < len(places):
             raise self.error("a file of Gaussians under two names")
         return places
 

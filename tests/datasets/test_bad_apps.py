@@ -366,7 +366,8 @@ def test_a_bomb_is_refused_before_it_is_unpacked(frames, tmp_path):
 
 
 @pytest.mark.parametrize("name", [
-    "../rgbd/0.jpg", "../metadata", "../../escaped", "/rgbd/0.jpg", "..\\rgbd\\0.jpg", "C:/metadata"])
+    "../rgbd/0.jpg", "../metadata", "../../escaped", "/rgbd/0.jpg", "..\\rgbd\\0.jpg",
+    "C:/metadata"])
 def test_a_recording_with_a_name_that_leads_out_is_refused(frames, tmp_path, name):
     path = tmp_path / "walk.r3d"
     with zipfile.ZipFile(path, "w") as archive:
