@@ -195,7 +195,7 @@ def _discard_if_not_begun(workspace: Workspace, stage: str) -> Iterator[None]:
 def _warn_of_stale_uses(checks: WorkspaceCheck, row: Stage) -> None:
     for name in row.uses:
         check = checks.check(name)
-        if check.manifest and not check.fresh:
+        if check.manifest and not check.usable:
             logger.warning("%s is left out of %s: it is %s", name, row.verb, check.describe())
 
 
