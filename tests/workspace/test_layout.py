@@ -151,7 +151,7 @@ def test_a_manifest_that_cannot_be_trusted_names_the_file_and_the_remedy(
         "truncated": text[: len(text) // 2],
         "edited": text.replace('"iterations": 1', '"iterations": 2'),
         "unsigned": json.dumps({key: value[key] for key in value if key != "self"}),
-        "other schema": json.dumps({**value, "schema": 99}),
+        "other schema": json.dumps({**value, "schema": "99"}),
         "a list": "[]",
     }[damage])
     with pytest.raises(ManifestError) as caught:
@@ -159,6 +159,31 @@ def test_a_manifest_that_cannot_be_trusted_names_the_file_and_the_remedy(
     assert caught.value.exit_code == 7
     assert str(path) in caught.value.message
     assert f"recon clean train -w {workspace.root}" in caught.value.hint
+
+
+def test_a_manifest_of_a_newer_schema_asks_for_an_update_and_for_nothing_to_be_deleted(
+    workspace: Workspace
+) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    path = workspace.folder("train") / "manifest.json"
+    value = json.loads(path.read_text())
+    path.write_text(json.dumps({**value, "schema": 2}))
+    with pytest.raises(ManifestError, match="schema 2") as caught:
+        workspace.manifest("train")
+    assert "pdate recon" in caught.value.hint
+    assert "`" not in caught.value.hint
+
+
+def test_the_hint_of_a_damaged_manifest_names_the_scene_beside_it(workspace: Workspace) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    (workspace.folder("train") / "splats.ply").write_text("a scene")
+    (workspace.folder("train") / "manifest.json").write_text("{}")
+    with pytest.raises(ManifestError) as caught:
+        workspace.manifest("train")
+    hint = caught.value.hint
+    assert 0 <= hint.index(str(workspace.folder("train") / "splats.ply")) < hint.index("clean")
 
 
 def test_a_crash_at_any_rename_leaves_the_old_or_the_new_result_whole(
