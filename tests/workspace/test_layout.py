@@ -22,6 +22,7 @@ from recon_cli.workspace.manifest import (
     RunRecord,
     differences,
     find_changed_outputs,
+    version_differences,
 )
 
 RUN = RunRecord(1.0, 2, {}, {}, None, None, 1, "2020-01-01T00:00:00+00:00")
@@ -119,9 +120,9 @@ def test_a_renamed_photo_is_named_among_the_reasons(tmp_path: Path) -> None:
 def test_options_that_another_version_knew_or_did_not_know_are_named() -> None:
     before = ResultKey("export", 1, {"gone": None, "kept": 1.5}, (), {})
     after = ResultKey("export", 1, {"kept": 2.0, "crop": None}, (), {})
-    assert differences(before, after, section="export") == [
-        "export.kept changed: 1.5 -> 2", "option export.crop is new",
-        "option export.gone no longer exists"]
+    assert differences(before, after, section="export") == ["export.kept changed: 1.5 -> 2"]
+    assert version_differences(before, after, section="export") == [
+        "option export.crop is new", "option export.gone no longer exists"]
 
 
 def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> None:
