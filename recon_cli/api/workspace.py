@@ -199,7 +199,7 @@ class Workspace:
             raise InputError(f"There is no split {split!r}.",
                              hint="Ask for train, validation or test.")
         job, config = self._open.open_job(TrainConfig)
-        plan.require_fresh(job, ("ingest", "sfm"))
+        plan.require(job.inspect(), ("ingest", "sfm"), "views")
         folder = job.workspace.folder
         trained = job.workspace.manifest("train") is not None
         run_config = read_config(folder("train")) if trained else None

@@ -75,11 +75,11 @@ def _load_held_out(
     job: Job, config: EvaluateConfig
 ) -> tuple[str, list[ReferenceView], StageContext]:
     """Returns the name of the workspace of -w, its held-out views, and where to render them."""
-    plan.require_fresh(job, ("ingest", "sfm"))
+    plan.require(job.inspect(), ("ingest", "sfm"), "eval")
     inputs = StageInputs({name: job.workspace.folder(name) for name in ("ingest", "sfm")})
     max_size = config.max_size
     if max_size is None:
-        trained = job.inspect().check("train").fresh
+        trained = job.inspect().check("train").usable
         max_size = (read_config(job.workspace.folder("train")) if trained
                     else QUALITIES["normal"]).max_size
     ctx = execute.stage_context(job, stage("evaluate"), lambda _done, _total: None)

@@ -130,7 +130,7 @@ def _read(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, int] | None
         raise FormatError(f"{path} is missing.", hint=_HINT)
     try:
         if path.suffix.lower() == ".npy":
-            values = np.asarray(np.load(path, allow_pickle=False))
+            values = np.array(np.load(path, mmap_mode="r"))  # refuses a shape that the file lacks
         elif path.suffix.lower() == ".exr":
             values = read_exr(path)
         elif path.suffix.lower() in _PACKED:

@@ -65,7 +65,7 @@ def read_llff(folder: Path) -> PosedSet:
 def _read_rows(path: Path) -> NDArray[np.float64]:
     """Returns [N, 3, 5]."""
     try:
-        values = np.asarray(np.load(path, allow_pickle=False))
+        values = np.array(np.load(path, mmap_mode="r"))  # refuses a shape that the file lacks
     except (OSError, ValueError, EOFError) as error:
         raise FormatError(f"{path} cannot be read: {error}.", hint=_HINT) from error
     if values.ndim != 2 or values.shape[1] not in _NUMBERS or values.dtype.kind not in "fiu":

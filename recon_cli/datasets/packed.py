@@ -16,6 +16,7 @@ from pathlib import Path
 
 from recon_cli.errors import FormatError
 from recon_cli.workspace import layout
+from recon_cli.workspace.paths import leads_out
 
 _ENTRY = re.compile(r"(?:[^/\\]+/)?(?:metadata|rgbd/[^/\\]+\.(?:jpg|jpeg|depth|conf))")
 _HINT = "Copy the recording from the phone again."
@@ -61,7 +62,12 @@ def unpacked(path: Path, out: Path) -> Iterator[Path]:
 def _unpack(path: Path, folder: Path) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
-            entries = [entry for entry in archive.infolist() if _ENTRY.fullmatch(entry.filename)]
+            listed = archive.infolist()
+            if out := next((entry for entry in listed if leads_out(entry.filename)), None):
+                raise FormatError(
+                    f"{path} holds {out.filename!r:.80}, which leads out of its folder.",
+                    hint=_HINT)
+            entries = [entry for entry in listed if _ENTRY.fullmatch(entry.filename)]
             _check(path, entries, folder)
             for entry in entries:
                 _extract(archive, entry, folder / entry.filename, path)

@@ -73,7 +73,8 @@ def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
                 hint="Rename one of the folders: tables tell scenes apart by their names.")
         scenes[name] = path
         if Workspace(path).holds_results:
-            plan.require_fresh(Job(Workspace(path)), ("ingest", "sfm"))
+            plan.require(
+                Job(Workspace(path)).inspect(), ("ingest", "sfm"), f"a scene of {path}", fresh=True)
             continue
         if not path.exists():
             raise InputError(f"{path} does not exist.", hint="Check the path.")

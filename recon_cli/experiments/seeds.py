@@ -89,6 +89,7 @@ def score_seeds(job: Job, config: EvaluateConfig, count: int) -> SeedScores:
     plan.run(job, "eval", [Target("evaluate", config)])
     root = job.workspace.root
     inspection = job.inspect()
+    plan.require(inspection, stage("train").needs, "eval --seeds", fresh=True)  # it trains on them
     configs: dict[str, StageConfig] = {}
     for name in _SEEDED:
         check = inspection.check(name)

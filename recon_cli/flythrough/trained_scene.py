@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.context import StageInputs
-from recon_cli.errors import StageError
+from recon_cli.errors import ManifestError, StageError
 from recon_cli.export.synthetic_cameras import synthetic_scene
 from recon_cli.io.training_scene import load_scene
 from recon_cli.pipeline import plan
@@ -67,13 +67,13 @@ class TrainedScene:
 def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> TrainedScene:
     """Returns the trained scene of a workspace; StageError if the model is missing or stale.
 
-    `model` is auto (the pruned one if it is fresh), base or pruned; `verb` is for messages.
+    `model` is auto (the pruned one if it is not stale), base or pruned; `verb` is for messages.
     """
     inspection, folder = job.inspect(), job.workspace.folder
     origin = ImportRecord.read(folder("train"))
     viewless = origin is not None and not origin.views
     needs = ("train",) if viewless else _NEEDS
-    manifests = {name: _require_fresh(inspection, name, verb) for name in needs}
+    manifests = plan.require(inspection, needs, verb)
     if viewless and model == "pruned":
         raise StageError(
             "This workspace has no compact (pruned) model: a scene without views cannot be pruned.",
@@ -87,29 +87,28 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
     else:
         inputs = StageInputs({name: folder(name) for name in _NEEDS})
         scene = load_scene(inputs.folders, validation=config.validation)
-        evidence = SfmSummary.from_json(manifests["sfm"].run.summary).world.evidence
-        z_up, metres = evidence.up_found, evidence.metres
+        z_up, metres = _read_world(manifests["sfm"])
     return TrainedScene(
         "pruned" if pruned else "base", splats, digest_of(splats), config.sh_degree,
         config.max_size, scene, z_up, metres,
         assumed_up=origin.up() if origin is not None and viewless else None)
 
 
-def _require_fresh(inspection: WorkspaceCheck, name: str, verb: str) -> Manifest:
-    check = inspection.check(name)
-    if check.manifest is None or not check.fresh:
-        raise StageError(
-            f"{verb} needs {name}, which is {check.describe()}.",
-            hint=f"Run `{plan.command(inspection, check)}` first.")
-    return check.manifest
+def _read_world(sfm: Manifest) -> tuple[bool, bool]:
+    """Returns whether z is up and a unit is a metre; no, where another version's record differs."""
+    try:
+        evidence = SfmSummary.from_json(sfm.run.summary).world.evidence
+    except ManifestError:
+        return False, False
+    return evidence.up_found, evidence.metres
 
 
 def _use_pruned(inspection: WorkspaceCheck, model: str, verb: str) -> bool:
     check = inspection.check("prune")
-    if model == "pruned" and not check.fresh:
+    if model == "pruned" and not check.usable:
         raise StageError(
             f"{verb} needs the compact (pruned) model, which is {check.describe()}.",
             hint=f"Run `recon prune` first, or `recon {verb} --model base`.")
-    if model == "auto" and check.manifest and not check.fresh:
+    if model == "auto" and check.manifest and not check.usable:
         logger.warning("the compact (pruned) model is not used: it is %s", check.describe())
-    return check.fresh and model != "base"
+    return check.usable and model != "base"

@@ -1,7 +1,8 @@
 """How every kernel is compiled, and where the machine code is kept.
 
 Compiling takes seconds, so the machine code is kept in the user's cache folder. numba stores it by
-pickle, which executes code from the file: the folder must belong to the user alone. Its name holds
+pickle, which executes code from the file: the folder must belong to the user alone. Each file
+begins with its digest: a bit that a disk turned would end every command by a signal. Its name holds
 a digest of the CPU, the versions and all sources of kernels/ and render/numba (numba checks only
 the file that a kernel stands in, not inlined functions), so that other code is never loaded. Where
 and when the sources were installed counts too: numba compiles again for another place or time.
@@ -12,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import pickle
 import platform
 import stat
 import sys
@@ -24,12 +26,15 @@ import llvmlite
 import llvmlite.binding as llvm
 import numba
 from numba.core import config
+from numba.core.caching import IndexDataCacheFile
 
 from recon_cli import machine
 
 logger = logging.getLogger("recon")
+_DIGEST_BYTES = hashlib.sha256().digest_size
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
 Compiled = Callable[..., Any]
+CODE = ".nbc"  # end of the name of a file of machine code
 unsaved: list[OSError] = []  # why kernels were not kept
 
 
@@ -43,8 +48,45 @@ def kernel(function: Compiled) -> Compiled:
             dispatcher.enable_caching()
         finally:
             config.CACHE_DIR = before
-        dispatcher._cache.save_overload = partial(_save, dispatcher._cache.save_overload)
+        cache = dispatcher._cache
+        cache._cache_file = _CheckedFiles(
+            cache._cache_path, cache._impl.filename_base, cache._impl.locator.get_source_stamp())
+        cache.save_overload = partial(_save, cache.save_overload)
     return dispatcher  # type: ignore[no-any-return]
+
+
+class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc]
+    """The machine code of a kernel: a file a signature, named by it, that begins with its digest.
+
+    numba's own files have none, and an index that two processes may write at once.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Writes machine code, whole or not at all."""
+        code = self._dump(data)
+        with self._open_for_write(str(self._path(key))) as file:
+            file.write(self._digest(key, code) + code)
+
+    def load(self, key: Any) -> Any:
+        """Returns machine code; None where there is none, or it is damaged."""
+        path = self._path(key)
+        try:
+            found = path.read_bytes()
+        except OSError:
+            return None
+        digest, code = found[:_DIGEST_BYTES], found[_DIGEST_BYTES:]
+        if self._digest(key, code) != digest:
+            logger.warning("the compiled kernel %s is damaged; compiling it again", path)
+            return None
+        return pickle.loads(code)
+
+    def _digest(self, key: Any, code: bytes = b"") -> bytes:
+        """Returns the digest of a signature and its machine code: that of another one is damage."""
+        return hashlib.sha256(repr((key, self._source_stamp)).encode() + b"\0" + code).digest()
+
+    def _path(self, key: Any) -> Path:
+        name = f"{Path(self._index_name).stem}.{self._digest(key).hex()[:16]}{CODE}"
+        return Path(self._cache_path) / name
 
 
 def _save(save: Callable[..., None], signature: Any, machine_code: Any) -> None:

@@ -20,6 +20,7 @@ from recon_cli.workspace.manifest import (
     ResultKey,
     differences,
     find_changed_outputs,
+    version_differences,
 )
 
 _LENGTH = ("iterations", "minutes")  # options that decide only how long a training is
@@ -136,8 +137,9 @@ def _obstacles(
     workspace: Workspace, row: Stage, key: ResultKey, finished: Manifest
 ) -> list[str]:
     """Returns in words why a run of `key` does not prolong a finished one."""
-    reasons = differences(_without_length(finished.key), _without_length(key), section=row.name,
-                          late=row.config.late_fields())
+    keys, late = (_without_length(finished.key), _without_length(key)), row.config.late_fields()
+    reasons = version_differences(*keys, section=row.name, late=late)
+    reasons += differences(*keys, section=row.name, late=late)
     reasons += find_changed_outputs(
         workspace.folder(row.name), finished, row.volatile, edits=row.edits)
     if finished.run.summary.get("blocks"):

@@ -215,7 +215,7 @@ def _discard_if_useless(workspace: Workspace, row: Stage, earlier: PartialRun) -
 def _warn_of_stale_uses(checks: WorkspaceCheck, row: Stage) -> None:
     for name in row.uses:
         check = checks.check(name)
-        if check.manifest and not check.fresh:
+        if check.manifest and not check.usable:
             logger.warning("%s is left out of %s: it is %s", name, row.verb, check.describe())
 
 

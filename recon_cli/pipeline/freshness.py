@@ -8,8 +8,9 @@ the default is another; after `iterations = 200` in recon.toml, it does not.
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,16 +21,20 @@ from recon_cli.config.settings import Settings
 from recon_cli.errors import ConfigError, ManifestError
 from recon_cli.pipeline.continuation import is_imported, made_by, may_resume, origin_row
 from recon_cli.stages import IMPORT, Stage
-from recon_cli.workspace.digests import Source, read_source
+from recon_cli.workspace.digests import Source, digest_file, read_source
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import (
+    SCENE,
     Manifest,
     PartialRun,
     ResultKey,
     describe_progress,
     differences,
     find_changed_outputs,
+    version_differences,
 )
+
+logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True)
@@ -39,24 +44,34 @@ class StageCheck:
     row: Stage  # the stage
     manifest: Manifest | None  # of the finished result; None where there is none
     reasons: tuple[str, ...] = ()  # why the result is stale; empty where it is fresh or missing
+    # how another version of recon made it that is not stale; this one would make another
+    version_reasons: tuple[str, ...] = ()
+    newer: bool = False  # a later version of recon made it, or what it was made from
     gone: tuple[str, ...] = ()  # inputs that no longer exist; that alone makes nothing stale
     partial_run: PartialRun | None = None  # an interrupted run that the next one would resume
     damage: ManifestError | None = None  # why the manifest of a result cannot be trusted
 
     @property
     def fresh(self) -> bool:
-        """Whether the result can be used as it is."""
+        """Whether a run would make the same result now."""
+        return self.usable and not self.version_reasons
+
+    @property
+    def usable(self) -> bool:
+        """Whether the result is what it was made to be, be it by another version of recon."""
         return self.manifest is not None and not self.reasons
 
     @property
     def state(self) -> str:
-        """One of damaged, fresh, partial, stale, missing."""
+        """One of damaged, fresh, partial, older, newer, stale, missing."""
         if self.damage:
             return "damaged"
         if self.fresh:
             return "fresh"
         if self.partial_run:
             return "partial"
+        if self.manifest and self.usable:
+            return "newer" if self.newer else "older"
         return "stale" if self.manifest else "missing"
 
     def describe(self) -> str:
@@ -64,7 +79,11 @@ class StageCheck:
         partial = self.partial_run
         if partial and not self.fresh:
             return f"unfinished ({describe_progress(partial.done, partial.total)})"
-        return f"{self.state}: {'; '.join(self.reasons)}" if self.reasons else self.state
+        state = self.state
+        if state in ("older", "newer"):
+            state = f"made by {'a newer' if self.newer else 'an older'} version of recon"
+        reasons = "; ".join((*self.reasons, *self.version_reasons))
+        return f"{state}: {reasons}" if reasons else state
 
 
 class WorkspaceCheck:
@@ -130,6 +149,16 @@ class WorkspaceCheck:
         """Returns the check of a stage's result against `config` and, if given, `sources`."""
         return self._compare(self.row(name), self._workspace.manifest(name), config, sources)
 
+    @property
+    def finished_scene(self) -> Path | None:
+        """The trained or imported scene, as it was written; None where there is none."""
+        path = self._workspace.folder(IMPORT.name) / SCENE
+        manifest = self.check(IMPORT.name).manifest
+        known = manifest.outputs.get(SCENE) if manifest else None
+        if known is None or not path.is_file() or digest_file(path, known).sha256 != known.sha256:
+            return None
+        return path
+
     def config(self, row: Stage, key: ResultKey | None) -> StageConfig:
         """Returns the known options that a result was made with, overlaid by the settings."""
         names = {item.name for item in dataclasses.fields(row.config)} if key else set()
@@ -147,7 +176,7 @@ class WorkspaceCheck:
         digests: dict[str, str | None] = {}
         for name in (*row.needs, *row.uses):
             check = self.check(name)
-            usable = check.fresh or (name in row.needs and check.manifest)
+            usable = check.usable or (name in row.needs and check.manifest)
             digests[name] = check.manifest.digest if usable and check.manifest else None
         return digests
 
@@ -167,19 +196,31 @@ class WorkspaceCheck:
         needs = [self.check(need) for need in row.needs]
         reasons = [
             f"{check.row.name} is {'damaged' if check.damage else 'stale'}" for check in needs
-            if check.damage or (check.manifest and not check.fresh)]
-        expected = self._current_key(row, config, manifest.key, sources)
-        reasons += differences(
-            manifest.key, expected, section=layers.section_of(row.config),
-            without=row.config.per_file_fields(), late=row.config.late_fields())
+            if check.damage or (check.manifest and not check.usable)]
+        version_reasons = [] if row.reads_other_versions else [
+            f"{check.row.name} is {check.state}" for check in needs
+            if check.usable and not check.fresh]
+        newer = manifest.key.version > row.version or any(
+            check.state == "newer" for check in needs)
+        keys = manifest.key, self._current_key(row, config, manifest.key, sources)
+        section, late = layers.section_of(row.config), row.config.late_fields()
+        gone_values = {name: value for name, value in manifest.key.config.items()
+                       if name in keys[1].config and not _accepts(row.config, name, value)}
+        version_reasons += [f"{section}.{name} no longer takes {str(value)[:40]}"
+                            for name, value in gone_values.items()]
+        without = (*row.config.per_file_fields(), *gone_values)
+        version_reasons += version_differences(*keys, section=section, without=without, late=late)
+        reasons += differences(*keys, section=section, without=without, late=late)
         reasons += find_changed_outputs(
             self._workspace.folder(row.name), manifest, row.volatile, row.states, row.edits)
         try:  # another version may have written another record
             summary = row.summary.from_json(manifest.run.summary)
             reasons += summary.contradictions(dataclasses.asdict(config))
         except ManifestError as error:
-            reasons.append(error.message)
-        return StageCheck(row, manifest, tuple(reasons), gone, self._resumable(row))
+            version_reasons.append(error.message)
+        return StageCheck(
+            row, manifest, tuple(reasons), tuple(version_reasons), newer, gone,
+            self._resumable(row))
 
     def _current_key(
         self, row: Stage, config: StageConfig, stored: ResultKey, sources: tuple[Source, ...]
@@ -208,6 +249,15 @@ class WorkspaceCheck:
         _, sources = self._read_again(partial.key.sources)
         expected = self._current_key(row, self.config(row, partial.key), partial.key, sources)
         return partial if expected.fingerprint == partial.key.fingerprint else None
+
+
+def warn_of_other_versions(checks: Iterable[StageCheck], verb: str) -> None:
+    """Logs which results that `verb` reads another version of recon made, in one line."""
+    others = [f"{check.row.name} ({'; '.join(check.version_reasons)})" for check in checks
+              if check.usable and not check.fresh]
+    if others:
+        logger.warning("%s takes as it is what another version of recon made: %s",
+                       verb, ", ".join(others))
 
 
 def _accepts(config: type[StageConfig], name: str, value: object) -> bool:

@@ -25,7 +25,7 @@ from recon_cli.errors import StageError
 from recon_cli.pipeline.compile_ahead import compile_ahead
 from recon_cli.pipeline.continuation import Start, is_imported, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
-from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck
+from recon_cli.pipeline.freshness import StageCheck, WorkspaceCheck, warn_of_other_versions
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.digests import Source, matches, read_source
 from recon_cli.workspace.layout import LOG, disk_errors
@@ -52,8 +52,9 @@ class StageStatus:
     """How a stage stands; `recon status --json` prints these fields under these names."""
 
     name: str  # of the stage and of its folder
-    state: str  # fresh, stale, partial, missing or damaged
-    reasons: tuple[str, ...]  # why it is stale or damaged, in words
+    # fresh, stale, partial, missing, damaged, or made by another version: older or newer
+    state: str
+    reasons: tuple[str, ...]  # why it is not fresh, in words
     done: int  # how much of an interrupted run would be resumed; 0 where there is none
     total: int  # of how much; 0 without an interrupted run
     seconds: float | None  # that the finished result took; None where there is none
@@ -77,7 +78,7 @@ def status(job: Job) -> tuple[StageStatus, ...]:
 def _status(check: StageCheck) -> StageStatus:
     run, partial = check.manifest and check.manifest.run, check.partial_run
     return StageStatus(
-        check.row.name, check.state, check.reasons,
+        check.row.name, check.state, (*check.reasons, *check.version_reasons),
         partial.done if partial else 0,
         partial.total if partial else 0,
         run.seconds if run else None,
@@ -157,32 +158,52 @@ def plan(checks: WorkspaceCheck, stage: str) -> tuple[Stage, ...]:
         StageError: one of them is never run implicitly; the hint is the command to type.
     """
     steps: list[Stage] = []
+    target = checks.row(stage)
 
     def visit(name: str) -> None:
         check = checks.check(name)
-        if check.fresh or check.row in steps:
+        if check.fresh or (check.usable and target.reads_other_versions) or check.row in steps:
             return
         if not check.row.auto:
-            raise StageError(
-                f"{checks.row(stage).verb} needs {name}, which is {check.describe()}.",
-                hint=f"Run `{command(checks, check)}` first.")
+            raise _need_error(checks, check, target.verb)
         for need in check.row.needs:
             visit(need)
         steps.append(check.row)
 
-    for need in checks.row(stage).needs:
+    for need in target.needs:
         visit(need)
     return tuple(steps)
 
 
-def require_fresh(job: Job, stages: Sequence[str]) -> None:
-    """Raises StageError unless the results of these stages are there and fresh."""
-    checks = job.inspect()
-    for check in map(checks.check, stages):
-        if not check.fresh:
-            raise StageError(
-                f"The {check.row.name} of {job.workspace.root} is {check.describe()}.",
-                hint=f"Run `{command(checks, check)} -w {job.workspace.root}` first.")
+def require(
+    checks: WorkspaceCheck, stages: Sequence[str], reader: str, *, fresh: bool = False
+) -> dict[str, Manifest]:
+    """Returns the manifests of results that `reader` needs, with a notice of other versions.
+
+    Those of another version of recon are only for readers that do not train: not with `fresh`.
+    StageError if one is missing or stale.
+    """
+    found = {name: checks.check(name) for name in stages}
+    for check in found.values():
+        if not check.fresh and (fresh or not check.usable):
+            raise _need_error(checks, check, reader)
+    warn_of_other_versions(found.values(), reader)
+    return {name: check.manifest for name, check in found.items() if check.manifest}
+
+
+def _need_error(checks: WorkspaceCheck, check: StageCheck, reader: str) -> StageError:
+    """Returns the error of a result that `reader` cannot take; its hint costs no training."""
+    scene = checks.finished_scene
+    hint = f"Run `{command(checks, check)}` first."
+    if scene and check.usable:
+        hint = (f"The scene in {scene} can be viewed, rendered, scored and exported as it is. "
+                "To train with this version of recon, read the capture into another workspace "
+                "with -w.")
+    elif scene:
+        hint += f" The scene of before stays in {scene} until it is trained anew."
+    if check.state == "newer":
+        hint = "Update recon: a newer version made this workspace."
+    return StageError(f"{reader} needs {check.row.name}, which is {check.describe()}.", hint=hint)
 
 
 def command(checks: WorkspaceCheck, check: StageCheck) -> str:
@@ -222,6 +243,7 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         checks = job.inspect()
         plan(checks, row.name)  # a fresh stage may have become stale by the last one
         fresh = None if again else _find_fresh(job, checks, target, sources)
+    warn_of_other_versions(map(checks.check, row.needs), row.verb)
     if fresh is None:
         _require_states(job, checks, row)
         start = Start.ANEW if again and target.start is Start.AUTO else target.start
@@ -270,7 +292,7 @@ def _find_fresh(
     manifest = check.manifest
     if manifest is None or not check.fresh:
         if manifest:
-            logger.info("%s is stale: %s", target.stage, "; ".join(check.reasons))
+            logger.info("%s is %s", target.stage, check.describe())
         return None
     if sources and sources != manifest.key.sources:
         key = dataclasses.replace(manifest.key, sources=sources)

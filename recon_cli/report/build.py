@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -84,14 +85,15 @@ def _check_path(job: Job, path: Path) -> None:
         raise ConfigError(
             f"{path} is not the name of an HTML file.",
             hint="Give a file that ends in .html with -o.")
-    root, real = job.workspace.root.resolve(), path.resolve()
+    # Path.resolve raises for a link to itself, which the report replaces like any other link
+    root, real = (Path(os.path.realpath(one)) for one in (job.workspace.root, path))
     for name in (".partial", ".old", *(row.name for row in job.table)):
         if real.is_relative_to(root / name):
             raise ConfigError(
                 f"{path} is in the folder of a stage, where every file is checked.",
                 hint="Give a file elsewhere with -o.")
     for source in last_sources(job, "ingest"):
-        folder = Path(source.path).resolve()
+        folder = Path(os.path.realpath(source.path))
         if real.is_relative_to(folder) and not real.is_relative_to(root):
             raise ConfigError(
                 f"{path} is in {folder}, an input of ingest: it would count as a new input.",

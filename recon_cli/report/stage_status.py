@@ -38,8 +38,8 @@ class StageReport:
 
     @property
     def fresh(self) -> bool:
-        """Whether its figures are up to date."""
-        return self.state == "fresh"
+        """Whether its figures are those of the scene, be it of another version of recon."""
+        return self.state in ("fresh", "older", "newer")
 
     @property
     def there(self) -> bool:
@@ -89,7 +89,7 @@ def _inspect_stage(inspection: WorkspaceCheck, row: Stage, job: Job) -> StageRep
     except ManifestError as error:
         again = f"recon {row.verb} --again -w {shlex.quote(str(root))}"
         return StageReport(row.name, folder, "damaged", error.message, again)
-    reasons, partial = list(check.reasons), check.partial_run
+    reasons, partial = [*check.reasons, *check.version_reasons], check.partial_run
     if check.state == "partial" and partial:
         reasons.insert(0, f"a run was interrupted at {partial.done} of {partial.total}")
     return StageReport(

@@ -10,10 +10,12 @@ together with files that splat-transform writes and reads.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +32,12 @@ from recon_cli.splats.sog import (
     Unpacked,
     encode_webp,
     pack_splats,
-    path_escapes,
     read_files,
 )
 from recon_cli.splats.values import Floats, UntrustedFile, describe_asset, normalize_quats
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import remove
+from recon_cli.workspace.paths import leads_out
 
 LOD_META = "lod-meta.json"
 _VERSION = 1
@@ -227,19 +229,24 @@ def load_lod(path: Path) -> LoadedScene:
     wanted: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for file, offset, count in index.finest():
         wanted[file].append((offset, count))
-    parts = []
-    for file, ranges in sorted(wanted.items()):
-        piece = read_files(Unpacked(index.file(file)))
+    archives = [Unpacked(place) for place in index.places(sorted(wanted))]
+    counts = [archive.count(archive.meta()) for archive in archives]
+    size = sum(archive.size for archive in archives)
+    if archives:  # many small ones may not claim more than all of them can hold
+        archives[0].check_count(sum(counts), size)
+    for (file, ranges), most in zip(sorted(wanted.items()), counts, strict=False):
         ranges.sort()
         ends = [0, *(offset + count for offset, count in ranges)]
-        if ends[-1] > len(piece) or any(
+        if ends[-1] > most or any(
                 offset < end for (offset, _), end in zip(ranges, ends, strict=False)):
-            raise index.error(
-                f"Gaussians of {index.names[file]} twice or beyond its {len(piece)}")
-        rows = np.concatenate([np.arange(offset, offset + count) for offset, count in ranges])
-        parts.append(piece.select(torch.from_numpy(rows)))
-    if index.environment is not None:
-        parts.append(read_files(Unpacked(index.environment)))
+            raise index.error(f"Gaussians of {index.names[file]} twice or beyond its {most}")
+    parts = []
+    for archive, file in zip_longest(archives, sorted(wanted)):
+        piece = read_files(archive)
+        if file is not None:  # else it is the environment, all of which is shown
+            rows = np.concatenate([np.arange(at, at + count) for at, count in wanted[file]])
+            piece = piece.select(torch.from_numpy(rows))
+        parts.append(piece)
     if not parts:
         raise index.error("a tree without Gaussians")
     degree = max(part.sh_degree for part in parts)
@@ -271,12 +278,16 @@ class _Index(UntrustedFile):
         environment = self.meta.get("environment")
         self.environment = None if not environment else self._path(environment)
 
-    def file(self, number: int) -> Path:
-        """Returns the meta.json of a file of Gaussians."""
-        return self._path(self.names[number])
+    def places(self, numbers: Sequence[int]) -> list[Path]:
+        """Returns the meta.json of files of Gaussians, and of the environment as the last."""
+        places = [self._path(self.names[number]) for number in numbers]
+        places += [self.environment] if self.environment else []
+        if len(set(map(os.path.realpath, places))) < len(places):
+            raise self.error("a file of Gaussians under two names")
+        return places
 
     def _path(self, name: object) -> Path:
-        if not isinstance(name, str) or path_escapes(name) or Path(name).name != META:
+        if not isinstance(name, str) or leads_out(name) or Path(name).name != META:
             raise self.error(f"the name {name!r:.80}; needed is a {META} in a folder beside it")
         return self.path.parent / name
 

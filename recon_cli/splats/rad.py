@@ -15,6 +15,8 @@ import json
 import math
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,16 @@ def load_rad(path: Path) -> LoadedScene:
         read_up_comment(comment), writer=comment)
 
 
+@dataclass(frozen=True)
+class _Chunk:
+    """The properties of a chunk: their place in the file, and what its JSON says."""
+
+    payload: int
+    end: int
+    count: int  # Gaussians
+    meta: Mapping[str, Any]
+
+
 class _RadFile(UntrustedFile):
     """An open .rad; every method raises FormatError if it breaks its own promises."""
 
@@ -78,13 +90,12 @@ class _RadFile(UntrustedFile):
 
     def columns(self) -> dict[str, Array]:
         """Returns the properties [N, ...] of the Gaussians that are the scene."""
-        chunks = self.meta.get("chunks")
-        if not isinstance(chunks, list) or not 0 < len(chunks) <= _MOST_CHUNKS:
-            raise self.error(f"chunks = {chunks!r:.40}; needed is a list")
-        parts = [self._chunk(chunk) for chunk in chunks]
-        found = sum(len(part["center"]) for part in parts)
+        chunks = self._open_chunks()
+        found = sum(chunk.count for chunk in chunks)
         if found != self.count:
             raise self.error(f"{found:,} Gaussians in its chunks, but states {self.count:,}")
+        self._check_size("Gaussians", self.count, 3 + 3 + 4 + 1 + 3)
+        parts = [self._read_chunk(chunk) for chunk in chunks]
         table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         children = table.pop("child_count", None)
         if children is None:
@@ -94,14 +105,36 @@ class _RadFile(UntrustedFile):
             raise self.error("a tree without ends")
         return {name: value[leaf] for name, value in table.items()}
 
-    def _chunk(self, entry: Any) -> dict[str, Array]:
-        """Returns the properties of a chunk by name."""
-        if not isinstance(entry, dict) or entry.get("filename") is not None:
-            raise self.error("chunks in other files, which are not read")
-        start = self._start + self.integer(entry, "offset", 0, len(self.data))
+    def _open_chunks(self) -> list[_Chunk]:
+        """Returns the chunks, no two of which share a byte; nothing is unpacked."""
+        entries = self.meta.get("chunks")
+        if not isinstance(entries, list) or not 0 < len(entries) <= _MOST_CHUNKS:
+            raise self.error(f"chunks = {entries!r:.40}; needed is a list")
+        places = []
+        for entry in entries:
+            if not isinstance(entry, dict) or entry.get("filename") is not None:
+                raise self.error("chunks in other files, which are not read")
+            start = self._start + self.integer(entry, "offset", 0, len(self.data))
+            places.append((start, start + self.integer(entry, "bytes", 0, len(self.data) - start)))
+        if any(end > start for (_, end), (start, _) in pairwise(sorted(places))):
+            raise self.error("chunks that overlap")
+        return [self._open_chunk(*place) for place in places]
+
+    def _open_chunk(self, start: int, end: int) -> _Chunk:
         meta, payload = self._json(start, _CHUNK_MAGIC)
         payload += _WORD  # the size of the properties, which each state their own
-        count = self.integer(meta, "count", 1, _CHUNK)
+        if payload > end:
+            raise self.error(f"a chunk of {end - start} bytes, which is cut short")
+        return _Chunk(payload, end, self.integer(meta, "count", 1, _CHUNK), meta)
+
+    def _check_size(self, what: str, count: int, numbers: int) -> None:
+        """Raises FormatError unless `count` rows of `numbers` and coefficients can be packed."""
+        numbers += 3 * TERMS[self.degree]
+        self.check_unpacked(4 * numbers * count, f"{count:,} {what}")
+
+    def _read_chunk(self, chunk: _Chunk) -> dict[str, Array]:
+        """Returns the properties of a chunk by name."""
+        meta, count = chunk.meta, chunk.count
         properties = meta.get("properties")
         if not isinstance(properties, list) or not all(
                 isinstance(one, dict) and isinstance(one.get("property"), str)
@@ -112,7 +145,7 @@ class _RadFile(UntrustedFile):
         def read(name: str, components: int, rows: int = count) -> Array:
             if name not in named:
                 raise self.error(f"a chunk without {name}")
-            return self._property(named[name], payload, components, rows)
+            return self._property(named[name], chunk, components, rows)
 
         values = {name: read(name, 3) for name in ("center", "rgb", "scales", "orientation")}
         values["alpha"] = read("alpha", 1)
@@ -129,6 +162,7 @@ class _RadFile(UntrustedFile):
             return {f"sh{degree}": read(f"sh{degree}", _BAND[degree]) for degree in degrees}
         entries = self.integer(self.meta, "shCodeCount", 1, _MOST_SPLATS)
         if not self._codes:
+            self._check_size("entries of a palette", entries, 0)
             self._codes = {
                 degree: read(f"sh{degree}_code", _BAND[degree], entries) for degree in degrees}
         labels = read("sh_label", 1)[:, 0]
@@ -137,7 +171,7 @@ class _RadFile(UntrustedFile):
         return {f"sh{degree}": self._codes[degree][labels] for degree in degrees}
 
     def _property(
-        self, meta: Mapping[str, Any], payload: int, components: int, rows: int
+        self, meta: Mapping[str, Any], chunk: _Chunk, components: int, rows: int
     ) -> Array:
         """Returns a property [rows, components]: scales as logarithms, rotations as wxyz."""
         name, encoding = meta["property"], meta.get("encoding")
@@ -145,8 +179,8 @@ class _RadFile(UntrustedFile):
         if decode is None:
             raise self.error(f"{name} in the unknown encoding {encoding!r:.40}")
         size = _SIZES.get(str(encoding), 1) * components * rows
-        offset = payload + self.integer(meta, "offset", 0, len(self.data))
-        data = self.data[offset: offset + self.integer(meta, "bytes", 0, len(self.data))]
+        offset = chunk.payload + self.integer(meta, "offset", 0, chunk.end - chunk.payload)
+        data = self.data[offset: offset + self.integer(meta, "bytes", 0, chunk.end - offset)]
         if meta.get("compression") == "gz":
             try:
                 data = zlib.decompressobj(-zlib.MAX_WBITS).decompress(data, size)

@@ -23,7 +23,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ from recon_cli.splats.values import (
     to_arrays,
 )
 from recon_cli.workspace.atomic import read_bytes, write_bytes
+from recon_cli.workspace.paths import leads_out
 
 _LEAST_OPACITY = 1e-6  # that PlayCanvas reads for a byte of 0; a logit has to be finite
 ROW = 64  # palette entries in a row of their image
@@ -159,8 +160,7 @@ def read_files(archive: SogFiles) -> Splats:
     path, meta = archive.path, archive.meta()
     means, scales, quats, sh0 = (
         archive.part(meta, name) for name in ("means", "scales", "quats", "sh0"))
-    count = archive.integer(meta, "count", 1, _MAX_COUNT)
-    archive.check_count(count)
+    count = archive.count(meta)
     low, high = archive.numbers(means, "mins", 3, 3), archive.numbers(means, "maxs", 3, 3)
     low_name, high_name = archive.files(means, 2)
     first = archive.pixels(low_name, count)
@@ -294,10 +294,16 @@ class SogFiles(UntrustedFile):
             raise self.error(f"the number {indices.max()} of a codebook of {len(book)}")
         return np.asarray(book[indices])
 
-    def check_count(self, count: int) -> None:
+    def count(self, meta: dict[str, Any]) -> int:
+        """Returns how many Gaussians there are, if they can be in files of that size."""
+        count = self.integer(meta, "count", 1, _MAX_COUNT)
+        self.check_count(count, self.size)
+        return count
+
+    def check_count(self, count: int, size: int) -> None:
         """Raises FormatError for implausibly many Gaussians: each takes about 16 bytes."""
-        if count > _SMALL + self.size:
-            raise self.error(f"{count} Gaussians in {self.size} bytes, as it claims")
+        if count > _SMALL + size:
+            raise self.error(f"{count} Gaussians in {size} bytes, as it claims")
 
     def pixels(
         self, name: str, count: int, *, size: tuple[int, int] | None = None
@@ -349,7 +355,7 @@ class Archive(SogFiles):
         if len(self._entries) < len(self._zip.infolist()):
             raise self.error("two entries of one name")
         for name in self._entries:
-            if path_escapes(name):
+            if leads_out(name):
                 raise self.error(f"the entry {name!r:.80}, which leaves the archive")
 
     def read(self, name: str, most: int) -> bytes:
@@ -382,7 +388,7 @@ class Unpacked(SogFiles):
         """Returns the content of a file of at most `most` bytes."""
         if name == META:
             return self.data
-        if "/" in name or path_escapes(name):
+        if "/" in name or leads_out(name):
             raise self.error(f"the name {name!r:.80}, which leaves the folder")
         try:
             return read_bytes(self.path.parent / name, most=most)
@@ -419,12 +425,6 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
         bits = int.from_bytes(data[21:25], "little")
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
-
-
-def path_escapes(name: str) -> bool:
-    """Returns whether a path would lead out of the folder that it is unpacked to."""
-    path = PurePosixPath(name.replace("\\", "/"))
-    return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name
 
 
 FORMAT = SplatFormat(

@@ -44,6 +44,8 @@ from recon_cli.splats.axes import (
 from recon_cli.splats.foreign import accept_surplus, warn_of_degree
 from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
+    HARMLESS_BYTES,
+    MAX_RATIO,
     Bytes,
     Floats,
     decode_opacities,
@@ -95,8 +97,6 @@ _ANTIALIASED = 1
 # Coefficients a channel that a file may have; those above degree 3 are cut off.
 _FILE_TERMS = (*TERMS, 24)
 _MAX_FRACTIONAL_BITS = 24
-# Limits of the unpacked size. A scene whose harmonics are all 0 reaches 5 times its size.
-_HARMLESS_BYTES, _MAX_RATIO = 1 << 24, 128
 _GZIP_LEVEL, _ZSTD_LEVEL = 6, 12  # those of Niantic's program
 
 
@@ -338,7 +338,7 @@ def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
         raise FormatError(f"{path} has positions of {bits} fractional bits, above 24: damaged.")
     header = SpzHeader(
         version, count, degree, bits, antialiased=bool(flags & _ANTIALIASED))
-    if not count or sum(header.sizes) > _HARMLESS_BYTES + _MAX_RATIO * size:
+    if not count or sum(header.sizes) > HARMLESS_BYTES + MAX_RATIO * size:
         raise FormatError(
             f"{path} promises {count} Gaussians, which do not fit into its {size} bytes.",
             hint="Copy the file again, or export it again from its source.")

@@ -20,6 +20,8 @@ _FAR = 10.0  # times the median distance of all from their middle
 _SHELL = 1.5  # outer distance over the inner one
 _BITS = 21  # per axis; three make a word of 63
 _LARGEST = float(np.finfo(np.float32).max)
+# Limits of what a file unpacks to. A .spz whose harmonics are all 0 reaches 5 times its size.
+HARMLESS_BYTES, MAX_RATIO = 1 << 24, 128
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
@@ -102,6 +104,15 @@ class UntrustedFile:
     def error(self, content: str) -> FormatError:
         """Returns the error for this file holding `content`."""
         return FormatError(f"{self.path} holds {content}.", hint="Write or copy the file again.")
+
+    def check_unpacked(self, promised: int, content: str) -> None:
+        """Raises FormatError if what `promised` bytes take cannot have been packed into the file.
+
+        To be called with all that is read so far and before it is unpacked: equal places that are
+        read again and again are promised again and again.
+        """
+        if promised > HARMLESS_BYTES + MAX_RATIO * len(self.data):
+            raise self.error(f"{content}, which do not fit into its {len(self.data):,} bytes")
 
     def json_object(self, text: bytes) -> dict[str, Any]:
         """Returns a JSON object without NaN that is not nested too deeply."""

@@ -53,6 +53,8 @@ class Stage:
     own_digests: bool = False  # it finds damage in its unfinished work by itself
     input_metavar: str = ""  # the user's input in usage; empty for stages that only read others
     optional_when_imported: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
+    # another version of recon may have made its needs: it only shows, scores or writes the scene
+    reads_other_versions: bool = False
     adds: bool = False  # it keeps the files of its last result that it does not write again
     # options that decide its last steps alone: where they are all that differs, it is given its
     # last result to continue
@@ -77,10 +79,12 @@ STAGES: tuple[Stage, ...] = (
     Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), from_states=("train",), renders=True),
     Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig,
-          EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True),
+          EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True,
+          reads_other_versions=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
           export_record.ExportSummary, export_record.VERSION, False, "recon_cli.stages.export",
-          renders=True, optional_when_imported=("ingest", "sfm"), adds=True))
+          renders=True, optional_when_imported=("ingest", "sfm"), reads_other_versions=True,
+          adds=True))
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, input_metavar="FILE")

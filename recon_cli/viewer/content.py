@@ -86,14 +86,14 @@ class ViewerContent:
 
 
 def load_workspace(job: Job, model: str) -> ViewerContent:
-    """Returns the trained scene of a workspace, with both models if both are fresh.
+    """Returns the trained scene of a workspace, with both models if neither is stale.
 
     `model` is auto, base or pruned: the initial one. StageError if it is missing or stale.
     """
     trained = open_trained_scene(job, model, verb="view")
     models = {trained.model: pack_splats(trained.splats)}
-    fresh = {"base", "pruned"} if job.inspect().check("prune").fresh else {"base"}
-    for name in sorted(fresh - models.keys()):
+    known = {"base", "pruned"} if job.inspect().check("prune").usable else {"base"}
+    for name in sorted(known - models.keys()):
         models[name] = pack_splats(read_ply(job.workspace.folder(_FOLDERS[name]) / "splats.ply"))
     scene = trained.scene
     parts = {HELD_OUT: scene.test, TRAINING: scene.train, VALIDATION: scene.validation}

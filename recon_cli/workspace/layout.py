@@ -90,7 +90,7 @@ class Workspace:
                 f"The workspace {self.root} cannot be made: {error.strerror}.",
                 hint="Give another folder with -w.") from error
         try:
-            with hold_lock(self.root, verb):
+            with hold_lock(self.root, verb), disk_errors(self.root, f"running {verb}"):
                 self.recover()
                 yield
         except BaseException:  # a bug and Ctrl-C leave no empty folder either
@@ -300,16 +300,32 @@ def has_link(path: Path, root: Path) -> bool:
 
 @contextmanager
 def disk_errors(root: Path, doing: str) -> Iterator[None]:
-    """Turns errors for want of space or permission in a workspace into a WorkspaceError."""
+    """Turns errors for want of space or permission in a workspace into a WorkspaceError.
+
+    So it does all errors where the workspace was renamed or deleted meanwhile.
+    """
+    before = _identity(root)
     try:
         yield
     except WorkspaceError:
         raise
     except Exception as error:
-        explained = _explain(error, root, doing)
+        explained = _explain(error, root, doing) if before in (None, _identity(root)) else (
+            WorkspaceError(
+                f"The workspace {root} was renamed or deleted while {doing}.",
+                hint="Run the same command with -w and its new place; it continues there."))
         if explained is None:
             raise
         raise explained from error
+
+
+def _identity(folder: Path) -> tuple[int, int] | None:
+    """Returns what a folder keeps when it is renamed, None where there is none."""
+    try:
+        found = folder.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _explain(error: Exception, root: Path, doing: str) -> ReconError | None:

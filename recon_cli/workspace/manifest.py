@@ -16,6 +16,7 @@ from recon_cli.workspace.digests import FileDigest, Source, digest_file, matches
 from recon_cli.workspace.json_record import KEY, JsonRecord
 
 NAME = "manifest.json"
+SCENE = "splats.ply"  # in the results of train and prune
 SCHEMA = 1
 _NAME_BYTES = 255  # the most that file systems take
 _MAX_REASONS = 3  # changes of one kind that are named; the rest is counted
@@ -95,12 +96,16 @@ class Manifest:
         path = folder / NAME
         clean = shlex.join(["recon", "clean", folder.name, "-w", str(folder.parent)])
         hint = f"Remove this result by `{clean}`, then make it again."
+        if (folder / SCENE).is_file():
+            hint = f"Copy {folder / SCENE}, the scene itself, elsewhere if you need it. {hint}"
         try:
             content = read_json(path, dict)
-            if content.get("schema") != SCHEMA:
+            schema = content.get("schema")
+            if type(schema) is int and schema > SCHEMA:
+                hint = "A newer recon made it: update recon. There is nothing to delete."
+            if schema != SCHEMA:
                 raise FormatError(
-                    f"{path} has schema {str(content.get('schema'))[:20]}, but this recon reads "
-                    f"schema {SCHEMA}.")
+                    f"{path} has schema {str(schema)[:20]}, but this recon reads schema {SCHEMA}.")
             if content.pop("self", None) != sha256_json(content):
                 raise FormatError(
                     f"{path} does not match its own checksum: it was edited or damaged.")
@@ -166,26 +171,37 @@ class PartialRun:
             return None
 
 
-def differences(
+def version_differences(
     old: ResultKey, new: ResultKey, *, section: str, without: Collection[str] = (),
     late: Collection[str] = (),
 ) -> list[str]:
-    """Returns in words how the key of a result differs from the one that a run would have now.
+    """Returns in words how a result differs from what this version of recon could make.
 
     Options `without` are not compared; those that came `late` may be missing, for None.
     """
     reasons = []
     if old.version != new.version:
         reasons.append(f"stage version {old.version} -> {new.version}")
-    for name in [*new.config, *(name for name in old.config if name not in new.config)]:
+    skipped = {*without, *late}
+    reasons += [f"option {section}.{name} is new" for name in new.config
+                if name not in old.config and name not in skipped]
+    return reasons + [f"option {section}.{name} no longer exists" for name in old.config
+                      if name not in new.config and name not in skipped]
+
+
+def differences(
+    old: ResultKey, new: ResultKey, *, section: str, without: Collection[str] = (),
+    late: Collection[str] = (),
+) -> list[str]:
+    """Returns in words how a result differs from that of a run now, but for the version of recon.
+
+    The arguments are those of `version_differences`.
+    """
+    reasons = []
+    for name in dict.fromkeys([*new.config, *old.config]):
         before, after = old.config.get(name), new.config.get(name)
-        if name in without:
-            continue
-        if name not in old.config and name not in late:
-            reasons.append(f"option {section}.{name} is new")
-        elif name not in new.config and name not in late:
-            reasons.append(f"option {section}.{name} no longer exists")
-        elif before != after:
+        known = name in old.config and name in new.config
+        if before != after and name not in without and (known or name in late):
             reasons.append(
                 f"{section}.{name} changed: {_value_text(before)} -> {_value_text(after)}")
     reasons += _source_changes(old.sources, new.sources)

@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 import stat
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from recon_cli.errors import ConfigError, FormatError
 
@@ -30,6 +30,12 @@ def is_plain_file(path: Path) -> bool:
 def is_address(text: str) -> bool:
     """Returns whether a text is the address of something on a network, not a path."""
     return _ADDRESS.match(text) is not None and not os.path.lexists(text)
+
+
+def leads_out(name: str) -> bool:
+    """Returns whether a path in an archive or index would lead out of the folder it belongs in."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name
 
 
 def refuse_special(path: Path, *, command: str = "") -> None:

@@ -365,15 +365,20 @@ def test_a_bomb_is_refused_before_it_is_unpacked(frames, tmp_path):
         unpack(path, tmp_path)
 
 
-def test_names_that_lead_out_are_not_written(frames, tmp_path):
+@pytest.mark.parametrize("name", [
+    "../rgbd/0.jpg", "../metadata", "../../escaped", "/rgbd/0.jpg", "..\\rgbd\\0.jpg",
+    "C:/metadata"])
+def test_a_recording_with_a_name_that_leads_out_is_refused(frames, tmp_path, name):
     path = tmp_path / "walk.r3d"
     with zipfile.ZipFile(path, "w") as archive:
-        for name, data in r3d_entries(frames).items():
-            archive.writestr(name, data)
-        archive.writestr("../rgbd/0.jpg", b"x")
-        archive.writestr("../../escaped", b"x")
-    assert len(unpack(path, tmp_path).images) == len(frames)
-    assert not list(tmp_path.rglob("escaped"))
+        for entry, data in r3d_entries(frames).items():
+            archive.writestr(entry, data)
+        archive.writestr(name, b"x")
+    before = set(tmp_path.rglob("*"))
+    with pytest.raises(FormatError, match="leads out") as caught:
+        unpack(path, tmp_path)
+    assert caught.value.hint
+    assert set(tmp_path.rglob("*")) - before == {tmp_path / "out"}
 
 
 def test_a_stream_that_unpacks_to_something_else_is_refused(frames, tmp_path):

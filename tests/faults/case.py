@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import random
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
 from forked import Finished, Running, start, start_process
-from judge import Outcome, Verdict, broken, clear_error, follow_hint, snapshot, wrong
+from judge import (
+    Outcome,
+    Verdict,
+    broken,
+    clear_error,
+    costs_training,
+    follow_hint,
+    snapshot,
+    wrong,
+)
 from lab import LIMIT, Lab, copy
 from moments import Moments
 
 T = TypeVar("T")
+# Of a reader: a decoder, and pixels or coefficients of a small file; then what text takes as JSON
+MOST_BYTES, MOST_RATIO = 1 << 30, 64
 
 
 @dataclass
@@ -82,9 +93,11 @@ class Case:
 
         return start(words, cwd=self.folder, prepare=ready)
 
-    def start_process(self, *words: str) -> Running:
+    def start_process(
+        self, *words: str, flags: Sequence[str] = (), environment: Mapping[str, str] | None = None
+    ) -> Running:
         """Starts a command as a new process of Python."""
-        return start_process(words, cwd=self.folder)
+        return start_process(words, cwd=self.folder, flags=flags, environment=environment)
 
     def finish(self, running: Running, limit: float = LIMIT) -> Finished:
         """Returns how a command ended."""
@@ -105,5 +118,21 @@ class Case:
             return bad
         if not follow:
             return clear_error(done)
+        if workspace is not None and self._keeps_scene(workspace) and (
+                bad := costs_training(done)):
+            return bad
         return follow_hint(done, workspace, lambda words: self.run(*words),
                            lambda: self.run(*done.words))
+
+    def _keeps_scene(self, workspace: Path) -> bool:
+        """Returns whether the scene of a workspace is there, byte for byte."""
+        scenes = [root / "train" / "splats.ply" for root in (workspace, self.lab.tiny)]
+        return scenes[0].is_file() and scenes[0].read_bytes() == scenes[1].read_bytes()
+
+    def judge_memory(self, done: Finished, path: Path) -> Verdict | None:
+        """Returns the verdict where a reader took more memory than a file's size explains."""
+        files = path.rglob("*") if path.is_dir() else [path]
+        size = sum(one.stat().st_size for one in files if one.is_file())
+        if done.memory_bytes > MOST_BYTES + MOST_RATIO * size:
+            return wrong(Outcome.BUG, done, f"{done.memory_bytes >> 20} MB for {size:,} bytes")
+        return None

@@ -22,7 +22,7 @@ import sys
 import time
 import tomllib
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,7 @@ class Finished:
     seconds: float
     timed_out: bool = False
     orphans: tuple[str, ...] = ()  # processes that outlived it
+    memory_bytes: int = 0  # at its peak, beyond what it began with
 
     def __str__(self) -> str:
         how = "timed out" if self.timed_out else f"exit code {self.code}"
@@ -106,6 +107,7 @@ class Running:
     pid: int
     said: tuple[Said, Said]  # on stdout and stderr
     begin: float
+    memory_bytes: int = 0  # that a forked one shares with the campaign
 
     def signal(self, number: int) -> None:
         """Sends a signal to the command, not to what it started."""
@@ -127,13 +129,13 @@ class Running:
         timed_out = not self.wait(limit)
         if timed_out:
             os.kill(self.pid, signal.SIGKILL)
-        _, status = os.waitpid(self.pid, 0)
+        _, status, usage = os.wait4(self.pid, 0)
         seconds = time.monotonic() - self.begin
         orphans = () if timed_out else tuple(_orphans())
         end_children()
         out, err = (stream.read() for stream in self.said)
         return Finished(self.words, os.waitstatus_to_exitcode(status), out, err, seconds,
-                        timed_out, orphans)
+                        timed_out, orphans, max(0, 1024 * usage.ru_maxrss - self.memory_bytes))
 
 
 def start(
@@ -155,14 +157,18 @@ def start(
             traceback.print_exc()
         finally:
             _leave(code)
-    return Running(tuple(words), pid, said, begin)
+    return Running(tuple(words), pid, said, begin, psutil.Process().memory_info().rss)
 
 
-def start_process(words: Sequence[str], *, cwd: Path) -> Running:
-    """Starts a command as the user would: a new process."""
+def start_process(
+    words: Sequence[str], *, cwd: Path, flags: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+) -> Running:
+    """Starts a command as the user would: a new process, with `flags` of Python."""
     said, begin = (Said(), Said()), time.monotonic()
     process = subprocess.Popen(
-        [sys.executable, "-P", "-c", _PROGRAM, *words], cwd=cwd, start_new_session=True,
+        [sys.executable, *flags, "-P", "-c", _PROGRAM, *words], cwd=cwd,
+        env={**os.environ, **(environment or {})}, start_new_session=True,
         stdin=subprocess.DEVNULL, stdout=said[0].target, stderr=said[1].target)
     process.returncode = 0  # `finish` waits for it by its number
     return Running(tuple(words), process.pid, said, begin)

@@ -7,6 +7,7 @@ import os
 import random
 import re
 import shutil
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,12 +17,13 @@ from case import Case
 from damages import DAMAGES, NUMBERS
 from fuzz_readers import hurt
 from judge import RIGHT, Outcome, Verdict, broken, notices, wrong
-from lab import FORMATS
+from lab import MADE
 from PIL import Image
 from workspace_kinds import classes
 
 from recon_cli.errors import ReconError
 from recon_cli.splats.ply import read_ply
+from recon_cli.splats.registry import read_splats
 
 _COMMON = ("--max-size", "256", "--frames", "8")
 _SUFFIXES = (".mov", ".mkv", ".jpg", ".png", ".txt", ".zip", ".json", ".ply", "", ".MP4", ".r3d",
@@ -33,7 +35,7 @@ def _ingest(case: Case, *inputs: Path | str) -> Verdict:
     words = ("ingest", *map(str, inputs), *_COMMON, "-w", str(workspace))
     before = {path: path.lstat().st_mtime_ns for path in case.folder.rglob("in/**/*")}
     done = case.run(*words)
-    if bad := broken(done):
+    if bad := broken(done) or case.judge_memory(done, Path(inputs[0])):
         return bad
     if {path: path.lstat().st_mtime_ns for path in case.folder.rglob("in/**/*")} != before:
         return wrong(Outcome.LOST, done, "the input was changed")
@@ -148,6 +150,38 @@ def hostile_set(case: Case) -> Verdict:
     return _ingest(case, folder)
 
 
+_ENTRIES = ("../metadata", "../rgbd/9.jpg", "/tmp/x", "rgbd/../../x", "..\\metadata", "metadata",
+            "rgbd/99.jpg", "a" * 300, "rgbd/\0.jpg", "C:/rgbd/1.jpg")
+
+
+def hostile_recording(case: Case) -> Verdict:
+    """A packed recording of a phone with damage, or with entries that it should not have."""
+    outside = case.outside()
+    folder = case.folder / "in"
+    folder.mkdir()
+    path = Path(shutil.copy(case.lab.root / "walk.r3d", folder))
+    kind = str(case.pick(("inside", "entry", "inside", "bomb", "inside", *DAMAGES)))
+    if kind == "inside":
+        path.write_bytes(hurt(path.read_bytes(), case.rng))
+    elif kind in ("entry", "bomb"):
+        name = case.rng.choice(_ENTRIES)
+        data = bytes(200 << 20) if kind == "bomb" else b"x"
+        with warnings.catch_warnings(), zipfile.ZipFile(
+                path, "a", zipfile.ZIP_DEFLATED) as archive:
+            warnings.simplefilter("ignore")  # of a name that is there twice
+            archive.writestr("rgbd/98.jpg" if kind == "bomb" else name, data)
+        kind = f"{kind} {name[:40]!r}"
+    else:
+        DAMAGES[kind](path, case.rng, case.folder / "spare")
+    case.tell(f"ingest of a recording: {kind}")
+    before = {one for one in case.folder.rglob("*") if "ws" not in one.parts}
+    verdict = _ingest(case, path)
+    left = {one for one in case.folder.rglob("*") if "ws" not in one.parts} - before
+    if left or not (outside / "thesis.db").is_file():
+        return wrong(Outcome.LOST, case.ran[-1], f"written outside: {sorted(left)[:3]}")
+    return case.canary_lost() or verdict
+
+
 def _spoil_text(path: Path, rng: random.Random, what: str) -> None:
     text = path.read_bytes().decode("latin-1")
     if what == "line":
@@ -169,22 +203,26 @@ def _spoil_text(path: Path, rng: random.Random, what: str) -> None:
 
 def hostile_splats(case: Case) -> Verdict:
     """A splat file with damage to its bytes or to what it packs."""
-    form = str(case.pick(FORMATS))
-    folder = case.folder / "in"
-    shutil.copytree(case.lab.splats(form).parent, folder / "others")  # to be taken in its place
-    path = shutil.copy(case.lab.splats(form), folder / f"room.{form}")
+    form = str(case.pick(MADE))
+    folder, sound = case.folder / "in", case.lab.splats(form)
+    shutil.copytree(case.lab.splats("ply").parent, folder / "others")  # to be taken in its place
+    if form == "lod":  # a folder, any file of which may be damaged
+        index = Path(shutil.copytree(sound.parent, folder / "lod")) / sound.name
+        path = case.rng.choice([index, *sorted(one for one in folder.glob("lod/*/*"))])
+    else:
+        index = path = Path(shutil.copy(sound, folder / f"room.{form}"))
     kind = case.rng.choice(("inside", "inside", "inside", "inside", "inside", *DAMAGES, "renamed"))
     if kind == "inside":
         path.write_bytes(hurt(path.read_bytes(), case.rng))
     elif kind == "renamed":
-        other = case.rng.choice([one for one in (*FORMATS, "zip", "txt", "mp4") if one != form])
-        path = path.rename(folder / f"other.{other}")
+        other = case.rng.choice([one for one in (*MADE, "zip", "txt", "mp4") if one != form])
+        index = path.rename(folder / f"other.{other}")
     else:
         DAMAGES[kind](path, case.rng, case.folder / "spare")
-    case.tell(f"import of {path.name}: {kind}")
+    case.tell(f"import of {index.name}: {kind} of {path.name}")
     workspace = case.folder / "ws"
-    done = case.run("import", str(path), "-w", str(workspace))
-    if bad := broken(done):
+    done = case.run("import", str(index), "-w", str(workspace))
+    if bad := broken(done) or case.judge_memory(done, index.parent):
         return bad
     if done.code:
         return case.judge_error(done, workspace)
@@ -192,7 +230,7 @@ def hostile_splats(case: Case) -> Verdict:
         splats = read_ply(workspace / "train" / "splats.ply")
     except ReconError as error:
         return wrong(Outcome.SILENTLY_WRONG, done, f"what was imported cannot be read: {error}")
-    count = len(read_ply(case.lab.tiny / "export" / "splats.ply"))
+    count = len(read_splats(sound))
     if not all(value.isfinite().all() for value in splats.parameters().values()):
         return wrong(Outcome.SILENTLY_WRONG, done, "what was imported is not finite")
     if kind in ("cut", "empty") and len(splats) < count and not notices(done.err):

@@ -146,6 +146,20 @@ def follow_hint(
     return worst([found, broken(after) or RIGHT])
 
 
+def costs_training(done: Finished) -> Verdict | None:
+    """Returns the verdict on a hint that trains again, or deletes, a scene that is whole.
+
+    It counts as clear where it names the scene, or training is what was typed.
+    """
+    hint = hint_of(done)
+    if done.words[0] in ("train", "import", "run") or "splats.ply" in hint:
+        return None
+    for words in commands_in(hint):
+        if words[0] in ("train", "run") or (words[0] == "clean" and "train" in words):
+            return wrong(Outcome.NO_HINT, done, "the hint costs a training")
+    return None
+
+
 def snapshot(folder: Path) -> dict[str, str]:
     """Returns the SHA-256 of every file below a folder, and where links lead, by path."""
     found = {}

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import disk_kinds
+import environment_kinds
 import input_kinds
 import kill_kinds
 import pair_kinds
@@ -45,6 +46,14 @@ KINDS = (
     Kind("odd folder", 10, settings_kinds.places),
     Kind("bad folder", 5, settings_kinds.bad_places),
     Kind("odd option", 5, settings_kinds.odd_words),
+    Kind("other version", 60, environment_kinds.other_version),
+    Kind("environment", 40, environment_kinds.environment),
+    Kind("permissions", 40, environment_kinds.permissions),
+    Kind("clock", 16, environment_kinds.clock),
+    Kind("renamed", 40, environment_kinds.renamed),
+    Kind("kernel cache", 8, environment_kinds.kernel_cache),
+    Kind("bad batch", 4, environment_kinds.bad_batch),
+    Kind("recording", 20, input_kinds.hostile_recording),
 )
 
 

@@ -8,16 +8,20 @@ import random
 import re
 import shutil
 import signal
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import av
 import colmap_sets
+import numpy as np
 import posed_sets
+from app_shots import Shot
 from compare import differing
 from forked import Finished, start
 from moments import Moments, sending
+from phone_writers import pack
 
 SAMPLE = Path(__file__).resolve().parents[2] / "recon_cli" / "samples" / "room.mp4"
 STAGES = ("ingest", "denoise", "sfm", "train", "prune", "evaluate", "export")
@@ -44,7 +48,8 @@ exposure = "off"
 rounds = 1
 recovery = 8
 """
-FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb")
+FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "rad", "html", "lod")
+MADE = (*FORMATS, "ksplat")  # what `recon import` takes; .ksplat is written by the lab
 # verb by name: what is typed, without -w, in a finished workspace. Each does its work again.
 FULL = {
     "ingest": ("ingest", "--again"), "denoise": ("denoise", "--again"), "sfm": ("sfm", "--again"),
@@ -83,7 +88,9 @@ class Lab:
         return self.root / f"half-{stage}"
 
     def splats(self, form: str) -> Path:
-        """The scene in a format."""
+        """The scene in a format; of lod its index, in a folder of its own."""
+        if form == "lod":
+            return self.root / "splats" / "lod" / "lod-meta.json"
         return self.root / "splats" / f"room.{form}"
 
     def sets(self) -> list[Path]:
@@ -147,6 +154,7 @@ def make(root: Path, rng: random.Random) -> Lab:
     _sound(lab, "train", "--prune", "-w", str(root / "mid"))
     for stage in STAGES:
         _interrupt(lab, stage, rng)
+    _write_recording(root / "walk.r3d", lab.clip)
     (root / "sets").mkdir()
     _write_sets(root / "sets")
     lab.save()
@@ -184,8 +192,38 @@ def _export_formats(lab: Lab) -> None:
            "-w", str(folder))
     (lab.root / "splats").mkdir()
     for form in FORMATS:
-        (folder / "export" / f"splats.{form}").rename(lab.splats(form))
+        name = "lod" if form == "lod" else f"splats.{form}"
+        target = lab.splats(form)
+        (folder / "export" / name).rename(target.parent if form == "lod" else target)
+    lab.splats("ksplat").write_bytes(_ksplat(30))
     shutil.rmtree(folder)
+
+
+def _ksplat(count: int) -> bytes:
+    """Returns a .ksplat without compression, of one section without coefficients."""
+    rows = np.zeros(count, [("means", "<f4", 3), ("scales", "<f4", 3), ("quats", "<f4", 4),
+                            ("rgba", "u1", 4)])
+    rows["means"] = np.random.default_rng(1).normal(size=(count, 3))
+    rows["scales"], rows["rgba"], rows["quats"][:, 0] = 0.1, 200, 1
+    header, section = bytearray(4096), bytearray(1024)
+    header[:2] = 0, 1
+    struct.pack_into("<IIIIH", header, 4, 1, 1, count, count, 0)
+    struct.pack_into("<II", section, 0, count, count)
+    return bytes(header + section) + rows.tobytes()
+
+
+def _write_recording(path: Path, clip: Path) -> None:
+    """Writes the clip as a recording of a phone that moves sideways before a wall."""
+    with av.open(str(clip)) as source:
+        source.streams.video[0].thread_type = "NONE"
+        frames = [frame.to_ndarray(format="rgb24") for frame in source.decode(video=0)]
+    shots = []
+    for at, rgb in enumerate(frames[::2]):
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * at
+        depth = np.full((36, 64), 2.0, np.float32)
+        shots.append(Shot(at, rgb, depth, pose, (200.0, 200.0, 128.0, 72.0), at / 10))
+    pack(path, shots)
 
 
 def _interrupt(lab: Lab, stage: str, rng: random.Random) -> None:

@@ -86,14 +86,76 @@ def test_an_output_changed_by_hand_makes_its_stage_stale(job: Job) -> None:
     assert stale(job)["train"] == ("output result.txt is missing",)
 
 
-def test_a_newer_version_of_a_stage_makes_its_results_stale(job: Job) -> None:
-    newer = [replace(row, version=row.version + (row.name == "evaluate")) for row in job.table]
+@pytest.fixture
+def trained(job: Job) -> Job:
+    """A job whose training left a scene."""
+    fake_stages.actions["train"] = lambda: (
+        job.workspace.partial("train") / "splats.ply").write_text("a scene")
+    bring(job, "train", again=True)
+    fake_stages.actions.clear()
+    bring(job, "prune", "evaluate", "export")
+    return job
+
+
+def updated(job: Job, name: str, by: int = 1) -> Job:
+    """A job of a recon whose stage `name` is some versions later."""
+    return replace(job, table=[
+        replace(row, version=row.version + by * (row.name == name)) for row in job.table])
+
+
+def test_a_result_of_an_older_version_is_made_again_where_it_is_asked_for(job: Job) -> None:
     now = next(row.version for row in job.table if row.name == "evaluate")
-    assert stale(replace(job, table=newer)) == {
-        "evaluate": (f"stage version {now} -> {now + 1}",)}
+    newer = updated(job, "evaluate")
+    assert stale(newer) == {"evaluate": (f"stage version {now} -> {now + 1}",)}
+    assert bring(newer, "evaluate") == ["evaluate"]
+    assert stale(newer) == {}
 
 
-def test_a_result_whose_record_another_version_wrote_is_stale(job: Job) -> None:
+@pytest.mark.parametrize("by", [1, -1])
+@pytest.mark.parametrize("name", ["ingest", "denoise", "sfm", "train"])
+def test_a_scene_of_another_version_is_scored_and_exported_with_a_notice_but_not_trained(
+    trained: Job, name: str, by: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    job, scene = updated(trained, name, by), trained.workspace.folder("train") / "splats.ply"
+    word = "older" if by > 0 else "newer"
+    states = {one.name: one.state for one in plan.status(job)}
+    behind = AFTER[name][:AFTER[name].index("evaluate")]
+    assert states[name] == word
+    assert {other: state for other, state in states.items() if state != "fresh"} == (
+        dict.fromkeys(behind, word))
+    with caplog.at_level("WARNING", "recon"):
+        assert bring(job, "evaluate", "export") == []
+        assert bring(job, "evaluate", "export", again=True) == ["evaluate", "export"]
+    assert "another version of recon made" in caplog.text
+    assert plan.require(job.inspect(), ("ingest", "sfm", "train"), "view").keys() == {
+        "ingest", "sfm", "train"}
+    for stage in ("prune", *(("train",) if name == "ingest" else ())):
+        with pytest.raises(StageError) as caught:
+            bring(job, stage, again=True)
+        assert (str(scene) if word == "older" else "Update recon") in caught.value.hint
+        assert "`recon" not in caught.value.hint
+    with pytest.raises(StageError):
+        plan.require(job.inspect(), ("train",), "a study", fresh=True)
+    assert scene.read_text() == "a scene"
+    assert {one.name: one.state for one in plan.status(job)} == states
+
+
+def test_a_scene_of_an_older_version_that_was_changed_is_stale(trained: Job) -> None:
+    scene = trained.workspace.folder("train") / "splats.ply"
+    scene.write_text("another")
+    with pytest.raises(StageError, match="changed by hand"):
+        bring(updated(trained, "ingest"), "evaluate", again=True)
+
+
+def test_the_hint_of_a_stale_stage_names_the_scene_that_is_there(trained: Job) -> None:
+    (trained.workspace.folder("sfm") / "result.txt").write_text("other cameras")
+    with pytest.raises(StageError) as caught:
+        plan.require(trained.inspect(), ("sfm", "train"), "view")
+    assert caught.value.hint.startswith("Run `recon sfm` first.")
+    assert str(trained.workspace.folder("train") / "splats.ply") in caught.value.hint
+
+
+def test_a_result_whose_record_another_version_wrote_is_older(job: Job) -> None:
     typed = [replace(row, summary=IngestSummary) if row.name == "ingest" else row
              for row in job.table]
     reason, = stale(replace(job, table=typed))["ingest"]
@@ -111,23 +173,22 @@ def test_an_option_that_a_result_contradicts_makes_it_stale_though_it_is_not_has
     assert changed["sfm"] == ("it is only a part",)
 
 
-def test_an_option_that_no_longer_exists_makes_its_stage_stale(job: Job) -> None:
+def test_an_option_that_no_longer_exists_is_of_another_version(job: Job) -> None:
     record_options(job, swarm_size=0.1)
     changed = stale(job)
-    assert list(changed) == AFTER["train"]
+    assert list(changed) == ["train", "prune"]
     assert changed["train"] == ("option train.swarm_size no longer exists",)
     assert bring(job, "train") == ["train"]
     assert stale(job) == {}
 
 
-def test_a_choice_that_no_longer_exists_makes_its_stage_stale_and_leaves_the_others(
-    job: Job,
-) -> None:
+def test_a_choice_that_no_longer_exists_is_of_another_version(job: Job) -> None:
     record_options(job, densify="swarm", iterations=100)
-    assert stale(job)["train"] == ("train.densify changed: swarm -> budget",)
+    assert stale(job)["train"] == ("train.densify no longer takes swarm",)
+    assert bring(job, "evaluate", "export") == []
     with pytest.raises(StageError) as caught:
-        bring(job, "evaluate")
-    assert caught.value.hint == "Run `recon train --iterations 100` first."
+        bring(job, "prune", again=True)
+    assert "`recon train --iterations 100`" in caught.value.hint
 
 
 def record_options(job: Job, **options: object) -> None:

@@ -18,7 +18,14 @@ from fake_stages import STEPS, bring, job_at, seen, stale
 from recon_cli.commands.workspace import status_table
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.errors import BackendError, InputError, ManifestError, StageError, WorkspaceError
+from recon_cli.errors import (
+    BackendError,
+    FormatError,
+    InputError,
+    ManifestError,
+    StageError,
+    WorkspaceError,
+)
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job
 from recon_cli.workspace.manifest import NAME
@@ -159,6 +166,30 @@ def test_a_failure_keeps_the_old_result_and_everything_finished_before(job: Job)
         bring(job, "sfm", "train", changes=changes)
     assert written(job, "train") == before
     assert "sfm" not in stale(job)
+
+
+@pytest.mark.parametrize("new", [True, False])
+@pytest.mark.parametrize("failure", [
+    None, FormatError("a frame cannot be read"), ValueError("a library's own error")])
+def test_a_workspace_that_is_renamed_in_mid_run_is_continued_at_its_new_place(
+    job: Job, folder: Path, tmp_path: Path, failure: Exception | None, new: bool
+) -> None:
+    job, name = (job_at(tmp_path / "new"), "ingest") if new else (job, "train")
+    video, moved = folder / "room.mp4", tmp_path / "moved"
+
+    def rename() -> None:
+        job.workspace.root.rename(moved)
+        if failure is not None:
+            raise failure
+
+    fake_stages.actions[name] = rename
+    with pytest.raises(WorkspaceError, match="renamed or deleted") as caught:
+        bring(job, name, video=video if new else None, again=True)
+    assert "-w" in caught.value.hint
+    assert not job.workspace.root.exists()
+    fake_stages.actions.clear()
+    assert bring(job_at(moved), name, video=video if new else None, again=not new) == [name]
+    assert not list(moved.glob(".partial/*/"))
 
 
 def test_a_run_refused_at_its_start_leaves_nothing_to_resume(job: Job) -> None:

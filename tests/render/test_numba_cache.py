@@ -54,7 +54,7 @@ def assert_same_picture(ours, theirs):
 # ---- from process to process ----
 
 def test_a_damaged_cache_is_noticed_and_compiled_again(damaged_run):
-    assert "cannot be read; compiling them again" in damaged_run.stderr
+    assert "is damaged; compiling it again" in damaged_run.stderr
     assert damaged_run.report["folder"] in damaged_run.stderr
     assert set(damaged_run.report["misses"].values()) == {1}
     assert damaged_run.report["is_warm"]
@@ -140,10 +140,6 @@ def test_without_a_place_for_a_cache_kernels_are_compiled_and_run(fresh_folder, 
     blocked.write_text("in the way")
     fresh_folder.setenv("RECON_CACHE_DIR", str(blocked / "cache"))
 
-    def double(values):
-        for i in range(len(values)):
-            values[i] *= 2
-
     with caplog.at_level(logging.WARNING, "recon"):
         compiled = kernel.kernel(double)
     assert "RECON_CACHE_DIR" in caplog.text
@@ -186,26 +182,53 @@ def test_a_new_folder_is_open_to_its_owner_alone(fresh_folder, tmp_path):
 
 # ---- damage, without the time to compile ----
 
-def test_files_that_a_crash_left_without_the_mark_of_a_full_cache_are_cleared(
-        fresh_folder, tmp_path, monkeypatch, caplog):
+def double(values):
+    for i in range(len(values)):
+        values[i] *= 2
+
+
+def negate(values):
+    for i in range(len(values)):
+        values[i] = -values[i]
+
+
+def doubled():
+    """What the kernel makes of ones, and how often it was compiled for that."""
+    compiled, values = kernel.kernel(double), np.ones(3, np.float32)
+    compiled(values)
+    return values.tolist(), sum(compiled.stats.cache_misses.values())
+
+
+def flip(at):
+    def change(path, _other):
+        data = bytearray(path.read_bytes())
+        data[at] ^= 1
+        path.write_bytes(data)
+
+    return change
+
+
+@pytest.mark.parametrize("damage", [
+    flip(0), flip(40), flip(-1), flip(-2000), lambda path, _: path.write_bytes(b""),
+    lambda path, _: os.truncate(path, 20), lambda path, _: os.truncate(path, 500),
+    lambda path, _: path.write_bytes(path.read_bytes() + b"more"),
+    lambda path, other: path.write_bytes(other.read_bytes())],
+    ids=["digest", "head", "end", "code", "empty", "no digest", "cut", "longer", "another kernel"])
+def test_a_damaged_file_is_not_loaded_but_compiled_again_with_a_notice(
+        fresh_folder, tmp_path, caplog, damage):
     fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path))
-    folder = kernel.cache_folder()
-    (folder / "numba").mkdir()
-    cut = folder / "numba" / "composite.nbi"
-    cut.write_bytes(b"")
-    calls = []
-
-    def run_all():
-        calls.append(cut.exists())
-        if cut.exists():
-            raise EOFError("Ran out of input")
-
-    monkeypatch.setattr(backend, "_run_all", run_all)
+    kernel.kernel(negate)(np.ones(3, np.float32))
+    other, = tmp_path.rglob(f"*{kernel.CODE}")
     with caplog.at_level(logging.WARNING, "recon"):
-        backend.warm_up()
-    assert calls == [True, False]
-    assert "compiling them again" in caplog.text
-    assert backend.is_warm()
+        assert doubled() == ([2, 2, 2], 1)
+        assert doubled() == ([2, 2, 2], 0)
+        path, = set(tmp_path.rglob(f"*{kernel.CODE}")) - {other}
+        assert not caplog.records
+        damage(path, other)
+        assert doubled() == ([2, 2, 2], 1)
+    assert str(path) in caplog.text
+    assert doubled() == ([2, 2, 2], 0)
+    assert len(caplog.records) == 1
 
 
 def test_a_fault_of_the_kernels_themselves_is_no_damage(fresh_folder, tmp_path, monkeypatch):
@@ -278,7 +301,7 @@ def test_while_another_process_compiles_its_progress_is_shown_and_nothing_runs(
     with backend._writing(folder):
         waiting = threading.Thread(target=backend.warm_up, args=(counted.release,))
         waiting.start()
-        (folder / "composite.nbi").touch()
+        (folder / "composite.nbc").touch()
         assert counted.acquire(timeout=20)
         assert not ran
         assert not counted.acquire(blocking=False)

@@ -302,6 +302,14 @@ def test_a_disk_that_fails_leaves_the_old_page(workspace, monkeypatch, number, s
     assert not list(workspace.glob(".report*"))
 
 
+def test_a_page_that_is_a_link_to_itself_is_replaced(workspace):
+    (workspace / "report.html").unlink(missing_ok=True)
+    (workspace / "report.html").symlink_to("report.html")
+    assert report(workspace) == 0
+    assert not (workspace / "report.html").is_symlink()
+    assert "<html" in (workspace / "report.html").read_text()
+
+
 def test_a_place_that_cannot_be_is_an_error_that_says_so(workspace, tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert report(workspace, "-o", tmp_path / "file" / "report.html") == 7

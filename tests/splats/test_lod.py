@@ -150,6 +150,11 @@ DAMAGES = {
     "an absolute file": lambda meta: meta["filenames"].__setitem__(0, "/etc/meta.json"),
     "a file that is not there": lambda meta: meta["filenames"].__setitem__(0, "9_9/meta.json"),
     "a file of another kind": lambda meta: meta["filenames"].__setitem__(0, "0_0/sh0.webp"),
+    "a file twice": lambda meta: (meta["filenames"].append(meta["filenames"][0]), leaves(
+        meta["tree"])[1]["lods"].update({"0": _first_leaf(meta) | {
+            "file": len(meta["filenames"]) - 1}})),
+    "a file twice by another name": lambda meta: meta.update(
+        environment=f"./{meta['filenames'][0]}"),
     "a file number too many": lambda meta: _first_leaf(meta).update(file=99),
     "a range beyond the file": lambda meta: _first_leaf(meta).update(count=2**31),
     "a range twice": lambda meta: leaves(meta["tree"])[1]["lods"].update({"0": _first_leaf(meta)}),
@@ -181,6 +186,16 @@ def test_a_truncated_or_missing_file_is_refused(tmp_path, name, keep):
     if keep:
         path.write_bytes(data[:keep])
     with pytest.raises(FormatError):
+        read_lod(tmp_path / "lod-meta.json")
+
+
+def test_many_files_may_not_claim_more_than_all_of_them_can_hold(tmp_path, monkeypatch):
+    written(tmp_path)
+    for name in meta_of(tmp_path)["filenames"]:
+        path = tmp_path / name
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"count": 700_000}))
+    monkeypatch.setattr(lod, "read_files", None)  # nothing is decoded
+    with pytest.raises(FormatError, match=r"(1400|2100|2800|3500)000 Gaussians in"):
         read_lod(tmp_path / "lod-meta.json")
 
 

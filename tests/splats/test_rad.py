@@ -185,7 +185,9 @@ def test_coefficients_may_lie_in_a_palette(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("more", "said"), [
     ({"version": 2}, "version = 2"), ({"count": 7}, "states 7"), ({"chunks": []}, "chunks ="),
     ({"chunks": [{"offset": 0, "bytes": 1, "filename": "0.radc"}]}, "other files"),
-    ({"chunks": [{"offset": 8, "bytes": 1}]}, "no RADC"), ({"lodTree": True}, "without child_c")])
+    ({"chunks": [{"offset": 8, "bytes": 1}]}, "no RADC"), ({"lodTree": True}, "without child_c"),
+    ({"chunks": [{"offset": 0, "bytes": 1}]}, "cut short"),
+    ({"chunks": [{"offset": 0, "bytes": 300}, {"offset": 299, "bytes": 1}]}, "overlap")])
 def test_a_header_that_contradicts_the_file_is_refused(
     more: dict[str, object], said: str, tmp_path: Path
 ) -> None:

@@ -46,6 +46,7 @@ def test_the_own_page_is_served_by_every_name_that_is_its_own(listens, host, ori
     (["evil.example:8080"], []),
     (["127.0.0.1.evil.example:8080"], []),
     (["user@evil.example:8080"], []),
+    (["[::1:8080"], []), (["a]b"], []), (["127.0.0.1:8080"], ["http://[1"]),  # no addresses
     (["127.0.0.1:8080", "evil.example"], []), ([], []), ([""], [])])
 def test_others_are_refused(hosts, origins):
     assert find_refusal("127.0.0.1", hosts, origins)
@@ -80,6 +81,36 @@ def test_a_page_is_not_served_by_the_name_of_a_stranger():
             assert answer.status == status
             assert (b"the one that recon printed" in answer.read()) == (status == 403)
             asked.close()
+
+
+def test_no_answer_may_be_shown_in_a_frame_of_another_page():
+    with start_server(HOST, None, label="x") as (server, _):
+        port = server.get_port()
+        for path, name, status in (
+                ("/", HOST, 200), ("/nothing", HOST, 404), ("/", "evil.example", 403)):
+            asked = http.client.HTTPConnection(HOST, port)
+            asked.request("GET", path, headers={"Host": f"{name}:{port}"})
+            answer = asked.getresponse()
+            assert answer.status == status
+            assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+            assert answer.headers["X-Frame-Options"] == "DENY"
+            asked.close()
+
+
+def test_requests_that_cannot_be_read_leave_no_traceback(caplog):
+    with start_server(HOST, None, label="x") as (server, _):
+        for request, status in (
+                (b"", b""), (b"hello\r\n\r\n", b""), (b"GET / HTTP/1.1\r\nHo", b""),
+                (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n", b""),  # does not wait for it
+                (b"GET / HTTP/1.1\r\nHost: [::1:8467\r\n\r\n", b"HTTP/1.1 403"),
+                (b"GET / HTTP/1.1\r\nHost: a]b\r\nUpgrade: websocket\r\n\r\n", b"HTTP/1.1 403")):
+            with socket.create_connection((HOST, server.get_port()), timeout=10) as asked:
+                asked.sendall(request)
+                if not status:
+                    asked.shutdown(socket.SHUT_WR)
+                answer = asked.makefile("rb").read()
+            assert answer[:len(status)] == status
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 def test_a_server_that_would_admit_strangers_does_not_run():

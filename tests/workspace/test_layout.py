@@ -22,6 +22,7 @@ from recon_cli.workspace.manifest import (
     RunRecord,
     differences,
     find_changed_outputs,
+    version_differences,
 )
 
 RUN = RunRecord(1.0, 2, {}, {}, None, None, 1, "2020-01-01T00:00:00+00:00")
@@ -119,9 +120,9 @@ def test_a_renamed_photo_is_named_among_the_reasons(tmp_path: Path) -> None:
 def test_options_that_another_version_knew_or_did_not_know_are_named() -> None:
     before = ResultKey("export", 1, {"gone": None, "kept": 1.5}, (), {})
     after = ResultKey("export", 1, {"kept": 2.0, "crop": None}, (), {})
-    assert differences(before, after, section="export") == [
-        "export.kept changed: 1.5 -> 2", "option export.crop is new",
-        "option export.gone no longer exists"]
+    assert differences(before, after, section="export") == ["export.kept changed: 1.5 -> 2"]
+    assert version_differences(before, after, section="export") == [
+        "option export.crop is new", "option export.gone no longer exists"]
 
 
 def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> None:
@@ -151,7 +152,7 @@ def test_a_manifest_that_cannot_be_trusted_names_the_file_and_the_remedy(
         "truncated": text[: len(text) // 2],
         "edited": text.replace('"iterations": 1', '"iterations": 2'),
         "unsigned": json.dumps({key: value[key] for key in value if key != "self"}),
-        "other schema": json.dumps({**value, "schema": 99}),
+        "other schema": json.dumps({**value, "schema": "99"}),
         "a list": "[]",
     }[damage])
     with pytest.raises(ManifestError) as caught:
@@ -159,6 +160,31 @@ def test_a_manifest_that_cannot_be_trusted_names_the_file_and_the_remedy(
     assert caught.value.exit_code == 7
     assert str(path) in caught.value.message
     assert f"recon clean train -w {workspace.root}" in caught.value.hint
+
+
+def test_a_manifest_of_a_newer_schema_asks_for_an_update_and_for_nothing_to_be_deleted(
+    workspace: Workspace
+) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    path = workspace.folder("train") / "manifest.json"
+    value = json.loads(path.read_text())
+    path.write_text(json.dumps({**value, "schema": 2}))
+    with pytest.raises(ManifestError, match="schema 2") as caught:
+        workspace.manifest("train")
+    assert "pdate recon" in caught.value.hint
+    assert "`" not in caught.value.hint
+
+
+def test_the_hint_of_a_damaged_manifest_names_the_scene_beside_it(workspace: Workspace) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    (workspace.folder("train") / "splats.ply").write_text("a scene")
+    (workspace.folder("train") / "manifest.json").write_text("{}")
+    with pytest.raises(ManifestError) as caught:
+        workspace.manifest("train")
+    hint = caught.value.hint
+    assert 0 <= hint.index(str(workspace.folder("train") / "splats.ply")) < hint.index("clean")
 
 
 def test_a_crash_at_any_rename_leaves_the_old_or_the_new_result_whole(

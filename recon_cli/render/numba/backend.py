@@ -5,9 +5,6 @@ Its kernels are loaded from the cache, or compiled under a progress bar, before 
 
 from __future__ import annotations
 
-import logging
-import pickle
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +19,7 @@ from torch import Tensor
 
 from recon_cli.render.contract import (
     EXACT, Approximation, RenderOutput, Statistics, StepOptions, TargetImage)
-from recon_cli.kernels.kernel import cache_folder, unsaved
+from recon_cli.kernels.kernel import CODE, cache_folder, unsaved
 from recon_cli.render.numba.optimizer import step
 from recon_cli.render.numba.step import PhotometricStep, camera_gradient
 from recon_cli.kernels.thread_pool import pool
@@ -35,9 +32,6 @@ KERNELS = 13  # that threads share; the progress counts these
 _SCIPY = "scipy.linalg"
 _WAIT_SECONDS = 0.25  # between looks at how far another process is
 _READY = "ready"  # file in the cache folder once every kernel is there
-_DAMAGE = (pickle.UnpicklingError, EOFError, ImportError, AttributeError, IndexError, KeyError,
-           ValueError, TypeError, RuntimeError)
-logger = logging.getLogger("recon")
 
 
 def render(
@@ -153,11 +147,13 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
     before, pool.observer = pool.observer, observe
     try:
         with _without_scipy():
-            if folder is None:
+            if folder is None or is_warm():
                 _run_all()
-            elif not (is_warm() and _can_run_all()):
-                with _writing(folder, lambda: count(len(_finished(folder)))):
-                    _compile(folder)
+            else:
+                with _writing(folder, lambda: count(len([*folder.rglob(f"*{CODE}")]))):
+                    _run_all()
+                    if not unsaved:
+                        (folder / _READY).touch()
     finally:
         pool.observer = before
     return time.perf_counter() - start
@@ -165,7 +161,7 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
 
 @contextmanager
 def _writing(folder: Path, on_wait: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Holds the lock of a folder: of two processes that write, numba may keep one's code for both.
+    """Holds the lock of a folder: two processes would compile the same.
 
     Calls `on_wait` now and then while another process holds it.
     """
@@ -182,35 +178,6 @@ def _writing(folder: Path, on_wait: Callable[[], None] = lambda: None) -> Iterat
         lock.release()
 
 
-def _finished(folder: Path) -> list[Path]:
-    """Returns the indices of the kernels that are there."""
-    return [*folder.rglob("*.nbi")]
-
-
-def _can_run_all() -> bool:
-    """Runs every kernel and tells whether that went well."""
-    try:
-        _run_all()
-    except _DAMAGE:
-        return False
-    return True
-
-
-def _compile(folder: Path) -> None:
-    """Compiles the kernels that a folder lacks; all of them where its files cannot be read."""
-    has_files = bool(_finished(folder))  # a crash can lose _READY and cut files short
-    try:
-        _run_all()
-    except _DAMAGE:
-        if not has_files:
-            raise
-        logger.warning("the compiled kernels in %s cannot be read; compiling them again", folder)
-        _clear(folder)
-        _run_all()
-    if not unsaved:
-        (folder / _READY).touch()
-
-
 @contextmanager
 def _without_scipy() -> Iterator[None]:
     """Keeps numba from importing scipy.linalg, slowly, for a BLAS that no kernel needs."""
@@ -222,15 +189,6 @@ def _without_scipy() -> Iterator[None]:
         yield
     finally:
         del sys.modules[_SCIPY]
-
-
-def _clear(folder: Path) -> None:
-    """Deletes the files of a folder; another process may do so at the same time."""
-    for path in folder.iterdir():
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
 
 
 def _run_all() -> None:
