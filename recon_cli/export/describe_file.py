@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -137,7 +138,9 @@ def _find_problems(
     means, lengths = splats.means.double(), splats.quats.double().norm(dim=1)
     flat = int((splats.log_scales <= FLAT + 1e-3).any(dim=1).sum())
     if flat:
-        found.append(f"{flat:,} of {count} Gaussians have a scale of 0")
+        # readers put small values in place of a 0, and trained ones may be as small
+        found.append(f"{flat:,} of {count} Gaussians are flat: a scale is at most "
+                     f"{math.exp(FLAT):.0e} units")
     none = int((lengths == 0).sum())  # other lengths than 1 are usual, and every viewer mends them
     if none:
         found.append(f"{none:,} of {count} rotations are 0 0 0 0, which some viewers do not draw")

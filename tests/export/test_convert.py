@@ -257,7 +257,7 @@ def test_a_file_is_described_by_what_it_holds(tmp_path: Path) -> None:
     splats = made()
     splats.quats[0] = 0
     splats.quats[1] = torch.tensor([2.0, 0, 0, 0])
-    splats.log_scales[2] = -math.inf
+    splats.log_scales[2], splats.log_scales[3, 1] = -math.inf, math.log(1e-9)
     path = ply(tmp_path / "a.ply", splats, up=np.array([0.0, 0, 1]), antialiased=True)
     found = describe_file(path, CONTEXT)
     assert (found.format, found.gaussians, found.sh_degree) == ("ply", 404, 0)
@@ -274,7 +274,8 @@ def test_a_file_is_described_by_what_it_holds(tmp_path: Path) -> None:
     assert found.overdraw is not None
     assert 1 < found.overdraw < 404
     text = "\n".join(found.problems)
-    assert "1 of 404 Gaussians have a scale of 0" in text
+    assert "3 scales of 0 are read" in text  # the other one is small
+    assert "2 of 404 Gaussians are flat" in text
     assert "1 of 404 rotations are 0 0 0 0" in text
     assert "length" not in text  # of quaternions, which is 1 in few files
     assert "404, degree 0" in found.describe()
