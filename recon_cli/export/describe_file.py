@@ -67,7 +67,7 @@ class FileFindings:
             "": self.file,
             "format": f"{self.format}, {self.bytes / 1e6:.2f} MB",
             "Gaussians": f"{self.gaussians:,}, degree {self.sh_degree}"
-            + (", and a backdrop" if self.backdrop else ""),
+            + (", the last of them the backdrop" if self.backdrop else ""),
             "up": self.up or "not stated",
             "writer": self.writer or "not stated",
             "bounds": _box(self.bounds),
@@ -101,7 +101,7 @@ def describe_file(path: Path, ctx: StageContext) -> FileFindings:
     problems += _find_problems(scene, radius, (low, high), overdraw)
     return FileFindings(
         file=str(path), format=format_of(path).name, bytes=path.stat().st_size,
-        gaussians=len(splats), sh_degree=splats.sh_degree, up=scene.up,
+        gaussians=len(splats.with_sphere()), sh_degree=splats.sh_degree, up=scene.up,
         writer=_printable(scene.writer), antialiased=scene.antialiased,
         backdrop=splats.backdrop is not None,
         bounds=_corners(means.amin(dim=0) + shift, means.amax(dim=0) + shift),

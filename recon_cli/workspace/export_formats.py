@@ -37,6 +37,7 @@ class ExportFormat:
     sh_degree: int = 3  # the highest that it holds; a scene of a higher one is fitted to it
     # values of `WriteSettings.sharing`, one after the other, until the loss is small enough
     sharing: tuple[int, ...] = (1,)
+    bounded: bool = True  # it holds the scene with `export.bounds`; False: as it was trained
 
     @property
     def patterns(self) -> tuple[str, ...]:
@@ -72,7 +73,7 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
                  sharing=_SHARING),
     ExportFormat("glb", "gaussians", "splats.glb", "recon_cli.splats.glb"),
     ExportFormat("html", "gaussians", "splats.html", "recon_cli.splats.html", more_files=(
-        "splats.jpg",), options=("title", "credits")),
+        "splats.jpg",), options=("title", "credits"), bounded=False),
     ExportFormat("lod", "gaussians", "lod/lod-meta.json", "recon_cli.splats.lod", more_files=(
         "lod/*",), options=("max_loss",), sharing=_SHARING),
     ExportFormat("rad", "gaussians", "splats.rad", "recon_cli.splats.rad"),

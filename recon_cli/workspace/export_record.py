@@ -21,9 +21,9 @@ from recon_cli.workspace.summaries import JsonRecord
 # mean square); rounding an image to 8 bits alone leaves 58.9 dB, 0.29 levels. Only pictures without
 # noise, such as renders, get there; the scenes of photos stay below 40 dB.
 CLEAN_DB = 45.0
-VERSION = 5  # of the stage; goes up when the meaning of a file changes, and makes the others stale
+VERSION = 6  # of the stage; goes up when the meaning of a file changes, and makes the others stale
 _FRAME = ("scale_between", "transform", "up")
-_SCENE = (*_FRAME, "crop", "drop_floaters", "drop_islands", "drop_backdrop", "sh_degree", "max_mb")
+_SCENE = (*_FRAME, "crop", "drop_floaters", "drop_islands", "backdrop", "sh_degree", "max_mb")
 _EARLIER = {"ingest": "other frames", "sfm": "earlier cameras", "train": "an earlier training",
             "prune": "an earlier pruning"}
 
