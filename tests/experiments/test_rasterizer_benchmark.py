@@ -18,7 +18,6 @@ from recon_cli.experiments.bench_scene import (
     answer,
     build_scene,
     oracle,
-    variants_for,
 )
 from recon_cli.experiments.instruments import Probe
 from recon_cli.kernels.thread_pool import pool
@@ -50,13 +49,9 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
         assert one["gradient_relative_error"] < GRADIENT
     numba = scene["backends"]["numba"]
     assert all(numba[name] > 0 for name in FIGURES if "error" not in name)
-    assert numba["pairs"][0] > 0
     stages = numba["stages"]
     assert {"forward: composite", "backward: decompose", "step: adam"} <= stages.keys()
-    errors = {one["name"]: one["image_error_rms"] for one in scene["variants"]}
-    assert errors["contract"] < IMAGE_RMS < errors["stop at T < 0.001"] < errors["stop at T < 0.01"]
-    assert errors["SH degree 2"] < errors["SH degree 1"] < errors["SH degree 0"]
-    for table in ("Figures", "Stages", "Error against float64", "Approximations on numba"):
+    for table in ("Figures", "Stages", "Error against float64"):
         assert f"\n\n{table} (room" in out
         assert f"\n### {table} (room" in text.read_text()
     assert text.read_text().startswith("mine\n")
@@ -67,7 +62,6 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
 @pytest.mark.parametrize(("words", "code", "said"), [
     (["--backend", "cuda"], 6, "'cuda'"),
     (["--size", "640"], 2, "WIDTHxHEIGHT"),
-    (["--plot", "front.pdf"], 2, ".png or .svg"),
     (["--markdown", "plain.md"], 3, "recon bench: begin"),
     (["--compare", "none.json"], 3, "cannot be read"),
     (["--compare", "other.json"], 3, "has the schema none"),
@@ -140,11 +134,3 @@ def test_what_is_not_a_number_is_infinitely_wrong() -> None:
     assert found.image_error_max == found.gradient_relative_error == float("inf")
     assert found.flipped_pixels == 1
     assert found.gradient_cosine == 0
-
-
-def test_only_numba_draws_the_approximations_of_the_rasterizer() -> None:
-    torch_names = {one.name for one in variants_for("torch", 3)}
-    numba_names = {one.name for one in variants_for("numba", 3)}
-    assert torch_names == {"SH degree 0", "SH degree 1", "SH degree 2"}
-    assert torch_names < numba_names
-    assert "SH degree 1" not in {one.name for one in variants_for("numba", 1)}
