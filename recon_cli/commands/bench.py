@@ -81,26 +81,20 @@ _compute_options = options.stack([
 
 
 def _output_options(plot: str = "") -> Decorator:
-    """Returns a decorator that adds --out, --markdown and, where there is one, --plot as `outputs`.
-    """
+    """Returns a decorator that adds --out and, where there is one, --plot as `outputs`."""
     def decorate(function: Command) -> Command:
         @functools.wraps(function)
         def collect(
-            *args: Any, json_file: Path | None, markdown: Path | None, plot: Path | None = None,
-            **typed: Any,
+            *args: Any, json_file: Path | None, plot: Path | None = None, **typed: Any
         ) -> Any:
-            return function(*args, outputs=OutputFiles(json_file, plot, markdown), **typed)
+            return function(*args, outputs=OutputFiles(json_file, plot), **typed)
 
         return options.stack([
             click.option("--out", "json_file", type=_FILE,
                          help="Write all figures to FILE, as JSON.  [default: nowhere]"),
             *([click.option("--plot", type=_FILE, help=(
                 f"{plot} into a .png or .svg; needs recon-cli[plot].  [default: nowhere]"))]
-              if plot else []),
-            click.option(
-                "--markdown", type=_FILE,
-                help="Write the tables between the lines `<!-- recon bench: begin -->` and "
-                     "`<!-- recon bench: end -->` of FILE.  [default: nowhere]")])(collect)
+              if plot else [])])(collect)
 
     return decorate
 

@@ -1,4 +1,4 @@
-"""Tables, ratios and the page of `recon bench`: pure functions of known inputs."""
+"""Tables and ratios of `recon bench`: pure functions of known inputs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from recon_cli.experiments.bench_measure import (
 )
 from recon_cli.experiments.bench_scene import Accuracy
 from recon_cli.experiments.instruments import Host, Timing, alternate
-from recon_cli.experiments.outputs import OutputFiles, Result
+from recon_cli.experiments.outputs import OutputFiles
 from recon_cli.experiments.rasterizer_benchmark import (
     BenchRequest,
     check_comparable,
@@ -189,42 +189,6 @@ def test_the_model_of_the_cpu_is_read_from_cpuinfo(tmp_path: Path) -> None:
     path.write_text("processor\t: 0\nmodel name\t: A: CPU\nmodel name\t: B\n")
     assert cpu_model(path) == "A: CPU"
     assert cpu_model(tmp_path / "none")
-
-
-# ---- the page ----
-
-PAGE = f"# Title\n\nby hand\n{outputs.BEGIN}\nold\n{outputs.END}\nby hand too\n"
-
-
-def write(path: Path, text: str) -> None:
-    path.write_text(outputs.replace_between_marks(path.read_text(), text))
-
-
-def test_only_what_stands_between_the_marks_is_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "page.md"
-    path.write_text(PAGE)
-    write(path, "\nnew\ntext\n")
-    assert path.read_text() == PAGE.replace("old", "\nnew\ntext\n")
-    write(path, "old")
-    assert path.read_text() == PAGE.replace("old", "\nold\n")
-
-
-@pytest.mark.parametrize("text", [
-    "", outputs.BEGIN, f"{outputs.END}\n{outputs.BEGIN}\n", PAGE + PAGE])
-def test_a_page_without_its_marks_is_refused_and_left_alone(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "page.md"
-    path.write_text(text)
-    with pytest.raises(FormatError, match="recon bench: begin"):
-        OutputFiles(markdown=path).write(Result({}, "head", []))
-    assert path.read_text() == text
-
-
-def test_a_page_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="cannot be read"):
-        OutputFiles(markdown=tmp_path / "none.md").check()
-
-
-# ---- the picture ----
 
 
 def test_without_matplotlib_the_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

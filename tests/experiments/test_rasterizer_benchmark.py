@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from recon_cli.cli import main
-from recon_cli.experiments import outputs
 from recon_cli.experiments.bench_measure import FIGURES
 from recon_cli.experiments.bench_scene import (
     Answer,
@@ -34,11 +33,10 @@ IMAGE_RMS, GRADIENT = 1e-5, 1e-3
 def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     tmp_path: Path, capsys: Said
 ) -> None:
-    figures, text = tmp_path / "bench.json", tmp_path / "page.md"
-    text.write_text(f"mine\n{outputs.BEGIN}\n{outputs.END}\nmine too\n")
+    figures = tmp_path / "bench.json"
     words = ["bench", "--quick", "--rounds", "1", "--threads", "1", "--device", "cpu",
              "--gaussians", "300", "--size", "64x48"]
-    assert main([*words, "--out", str(figures), "--markdown", str(text)]) == 0
+    assert main([*words, "--out", str(figures)]) == 0
     out = capsys.readouterr().out
     record = json.loads(figures.read_text())
     scene = record["scenes"]["room"]
@@ -53,16 +51,12 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     assert {"forward: composite", "backward: decompose", "step: adam"} <= stages.keys()
     for table in ("Figures", "Stages", "Error against float64"):
         assert f"\n\n{table} (room" in out
-        assert f"\n### {table} (room" in text.read_text()
-    assert text.read_text().startswith("mine\n")
-    assert text.read_text().endswith("mine too\n")
     assert pool.observer is None
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [
     (["--backend", "cuda"], 6, "'cuda'"),
     (["--size", "640"], 2, "WIDTHxHEIGHT"),
-    (["--markdown", "plain.md"], 3, "recon bench: begin"),
     (["--compare", "none.json"], 3, "cannot be read"),
     (["--compare", "other.json"], 3, "has the schema none"),
     (["--out", "none/a"], 3, "does not exist"),
@@ -77,7 +71,6 @@ def test_what_cannot_be_done_is_refused_before_anything_is_measured(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "recon_cli.experiments.rasterizer_benchmark.measure", lambda *_: pytest.fail("measured"))
-    Path("plain.md").write_text("no marks")
     Path("other.json").write_text("{}")
     assert main(["bench", *words]) == code
     err = capsys.readouterr().err
