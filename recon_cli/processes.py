@@ -83,13 +83,6 @@ def ask_to_end(process: subprocess.Popen[bytes]) -> None:
         process.terminate()
 
 
-def run_code(code: str) -> str:
-    """Runs Python code in a process of its own and returns its output."""
-    return subprocess.run(
-        python_command("-c", code), env=child_environment(), capture_output=True, text=True,
-        check=True).stdout
-
-
 def end_with_parent() -> None:
     """Ends this process when its standard input does, which is when its parent is gone."""
 

@@ -6,10 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from recon_cli import processes
-from recon_cli.processes import child_environment, protect_children, run_code, start_module
+from recon_cli.processes import child_environment, protect_children, start_module
 
 PACKAGE = Path(processes.__file__).parent
 # What starts programs, by module; "" stands for the whole module.
@@ -101,10 +99,3 @@ def test_processes_that_libraries_start_are_protected_as_well(tmp_path, monkeypa
     protect_children()
     subprocess.run([sys.executable, "-c", "import random"], cwd=tmp_path, check=True)
     assert not (tmp_path / "run").exists()
-
-
-def test_code_runs_with_the_environment_of_its_parent(monkeypatch):
-    monkeypatch.setenv("RECON_TEST", "here")
-    assert run_code("import os; print(os.environ['RECON_TEST'])") == "here\n"
-    with pytest.raises(subprocess.CalledProcessError):
-        run_code("raise SystemExit(3)")

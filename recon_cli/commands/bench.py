@@ -81,25 +81,21 @@ _compute_options = options.stack([
     options.assignments("ingest.frames=200"), options.compute(), options.verbosity])
 
 
-def _output_options(plot: str) -> Decorator:
-    """Returns a decorator that adds --out, --plot and --markdown as one `outputs`."""
+def _output_options(plot: str = "") -> Decorator:
+    """Returns a decorator that adds --out and, where there is one, --plot as `outputs`."""
     def decorate(function: Command) -> Command:
         @functools.wraps(function)
         def collect(
-            *args: Any, json_file: Path | None, plot: Path | None, markdown: Path | None,
-            **typed: Any,
+            *args: Any, json_file: Path | None, plot: Path | None = None, **typed: Any
         ) -> Any:
-            return function(*args, outputs=OutputFiles(json_file, plot, markdown), **typed)
+            return function(*args, outputs=OutputFiles(json_file, plot), **typed)
 
         return options.stack([
             _option("--out", "json_file", type=_FILE,
                          help="Write all figures to FILE, as JSON.  [default: nowhere]"),
-            _option("--plot", type=_FILE, help=(
-                f"{plot} into a .png or .svg; needs matplotlib.  [default: nowhere]")),
-            _option(
-                "--markdown", expert=True, type=_FILE,
-                help="Write the tables between the lines `<!-- recon bench: begin -->` and "
-                     "`<!-- recon bench: end -->` of FILE.  [default: nowhere]")])(collect)
+            *([_option("--plot", type=_FILE, help=(
+                f"{plot} into a .png or .svg; needs matplotlib.  [default: nowhere]"))]
+              if plot else [])])(collect)
 
     return decorate
 
@@ -141,7 +137,7 @@ class _BenchGroup(_OldSpelling, click.Group):
 @_option(
     "--quick", is_flag=True,
     help="A tiny scene and few rounds: whether it works, not how fast.  [default: off]")
-@_output_options("Draw speed against error")
+@_output_options()
 @_option(
     "--compare", type=options.PathType(dir_okay=False), metavar="FILE",
     help="Print the ratio of each figure of an earlier --out FILE to this run's.  "
@@ -150,11 +146,10 @@ class _BenchGroup(_OldSpelling, click.Group):
 @pass_call
 @click.pass_context
 def bench(ctx: click.Context, call: Call, /, outputs: OutputFiles, **typed: Any) -> None:
-    """Measure the rasterizers: speed against error.
+    """Measure the rasterizers: speed and error.
 
     Times every stage on a synthetic room and compares images and gradients with a rasterizer in
-    float64, for every backend and for approximations of it. `recon bench train` measures recipes
-    of training instead.
+    float64, for every backend. `recon bench train` measures recipes of training instead.
     """
     if ctx.invoked_subcommand is not None:
         _refuse_own_options(ctx)

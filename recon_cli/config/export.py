@@ -54,8 +54,11 @@ class ExportConfig(StageConfig):
         "that cover surfaces behind them or make these views worse.")
     drop_islands: bool = option(
         False, "Remove small groups of Gaussians far from all others, unless seen through windows.")
-    drop_backdrop: bool = option(
-        False, "Leave out the sphere of Gaussians that shows the grey backdrop of the training.")
+    backdrop: str = option(
+        "bounded", "What lies outside the room, up to the grey backdrop of the training: moved "
+        "inwards, so that viewers fit the room, and left out where no view shows it (bounded); as "
+        "in training (keep); or without the backdrop (drop). The page (html) is never bounded.",
+        choices=("bounded", "keep", "drop"))
     sh_degree: int | None = option(
         None, "Maximum degree of the spherical harmonics.", minimum=0, maximum=3,
         automatic="that of the scene")
@@ -96,7 +99,8 @@ class ExportConfig(StageConfig):
         "png", "Format of the texture.", choices=("png", "jpg"), per_file=True, expert=True)
     spz_version: int = option(
         3, "Version of .spz: 3 is read by most programs; 2 by older ones, with coarser "
-        "rotations; 4 by PlayCanvas' engine, but not by Spark.", minimum=2, maximum=4, per_file=True, expert=True)
+        "rotations; 4 by PlayCanvas' engine, but not by Spark.", minimum=2, maximum=4,
+        per_file=True, expert=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -45,8 +45,10 @@ GONE: dict[str, dict[str, tuple[Any, ...]]] = {
     "denoise": {"filter": ("bilateral",)},
     "train": {"poses": ("auto", "off"), "densify_scale": (0.01,)},
     "merge": {"validation": (0.05,)},
+    "export": {"drop_backdrop": (False,)},
 }
 
+_SUCCESSORS = {("export", "drop_backdrop"): 'Set export.backdrop to "drop" instead.'}
 FILE = "recon.toml"  # in the workspace
 Settings = dict[str, dict[str, Any]]  # section -> field -> value, explicit ones only
 C = TypeVar("C", bound=StageConfig)
@@ -155,7 +157,8 @@ def check_names(section: str, names: Iterable[str], *, where: str) -> None:
         if name not in known:
             raise ConfigError(
                 f"{where} sets {section}.{name}, which does not exist.",
-                hint="It is gone since an earlier version: leave it out."
+                hint=_SUCCESSORS.get((section, name),
+                                     "It is gone since an earlier version: leave it out.")
                 if name in GONE.get(section, {}) else
                 _suggest(name, known, f"Options of [{section}]:"))
 

@@ -1,4 +1,4 @@
-"""The measurement of `recon bench`: every backend, thread count and approximation."""
+"""The measurement of `recon bench`: every backend and thread count."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments import instruments
 from recon_cli.experiments.bench_scene import (
-    CONTRACT,
     QUICK,
     Accuracy,
     BenchScene,
@@ -25,8 +24,6 @@ from recon_cli.experiments.bench_scene import (
     answer,
     build_scene,
     oracle,
-    renderer_of,
-    variants_for,
 )
 from recon_cli.experiments.instruments import Host, Samples, Stopwatch, Timing
 from recon_cli.kernels.thread_pool import pool
@@ -40,16 +37,13 @@ from recon_cli.train.optimizer import SplatOptimizer
 SCHEMA = "recon-bench"
 VERSION = 1  # goes up when a key changes its name or meaning
 PASSES = ("forward", "backward", "step")
-_RATES = ("gpairs_per_s_forward", "gpairs_per_s_backward", "peak_fraction_forward",
-          "peak_fraction_backward")
 # The figures of each backend in every scene for which --compare prints a ratio.
 FIGURES = (
-    *(f"{name}_ms" for name in PASSES), *_RATES, "image_error_max", "gradient_relative_error")
+    *(f"{name}_ms" for name in PASSES), "image_error_max", "gradient_relative_error")
 _ADAM = "adam"  # the part of a step that updates the parameters
 
 Mark = Callable[[str], None]
 Work = Callable[[], Mapping[str, float]]  # returns the milliseconds of its parts
-Pairs = tuple[int, int] | None  # evaluated forward and backward; None where not counted
 
 
 @dataclass(frozen=True)
@@ -60,12 +54,6 @@ class Speed:
     # of whole passes, by PASSES (a step is forward, loss, backward, Adam), and of their parts, in
     # order, as "pass: part"
     times: dict[str, Timing]
-    # evaluated pairs of Gaussian and pixel over the time of compositing; None where not counted
-    gpairs_per_s_forward: float | None
-    gpairs_per_s_backward: float | None
-    # arithmetic of those pairs over the peak of the threads; None where no peak was measured
-    peak_fraction_forward: float | None
-    peak_fraction_backward: float | None
 
     @property
     def both_ms(self) -> float:
@@ -78,7 +66,6 @@ class Speed:
             "threads": self.threads,
             **{f"{name}_ms": self.times[name].ms for name in PASSES},
             **{f"{name}_iqr_ms": self.times[name].iqr_ms for name in PASSES},
-            **{name: getattr(self, name) for name in _RATES},
             "stages": {name: asdict(timing) for name, timing in self.times.items()
                        if name not in PASSES}}
 
@@ -90,13 +77,12 @@ class BackendResult:
     speed: Speed  # with all threads
     one_thread: Speed | None  # None on a GPU
     accuracy: Accuracy  # against the oracle
-    pairs: Pairs
     memory_bytes: int  # peak that a first forward and backward pass added, gradients included
 
     def record(self) -> dict[str, Any]:
         """Returns the figures by the names of the JSON file."""
         return {
-            **self.speed.record(), **_finite(self.accuracy), "pairs": self.pairs,
+            **self.speed.record(), **_finite(self.accuracy),
             "memory_bytes": self.memory_bytes,
             "one_thread": self.one_thread.record() if self.one_thread else None}
 
@@ -104,15 +90,6 @@ class BackendResult:
 def _finite(accuracy: Accuracy) -> dict[str, Any]:
     """Returns an accuracy as JSON, with null for infinity."""
     return {name: None if value == math.inf else value for name, value in asdict(accuracy).items()}
-
-
-@dataclass(frozen=True)
-class VariantResult:
-    """One approximation on one backend."""
-
-    name: str
-    time: Timing  # forward and backward
-    accuracy: Accuracy  # against the oracle, which follows the contract
 
 
 @dataclass(frozen=True)
@@ -124,8 +101,6 @@ class BenchedScene:
     height: int
     sh_degree: int
     backends: dict[str, BackendResult]  # by name, the fastest kind first
-    variants_of: str  # the backend that rendered the approximations
-    variants: list[VariantResult]  # the contract first, then the approximations
 
 
 @dataclass(frozen=True)
@@ -144,9 +119,6 @@ class BenchResult:
             "scenes": {name: {
                 **asdict(scene),
                 "backends": {name: backend.record() for name, backend in scene.backends.items()},
-                "variants": [
-                    {"name": variant.name, "time": asdict(variant.time),
-                     **_finite(variant.accuracy)} for variant in scene.variants],
             } for name, scene in self.scenes.items()}}
 
 
@@ -186,18 +158,15 @@ class BenchPlan:
     rounds: int  # behind each median
 
 
-def measure(plan: BenchPlan, host: Host, progress: Progress) -> BenchedScene:
+def measure(plan: BenchPlan, progress: Progress) -> BenchedScene:
     """Returns all results of one scene."""
     size = plan.size
     with use_threads(plan.threads), progress.bar(
-        "bench", 2 * (plan.rounds + 1) + 1, unit="round"
+        "bench", plan.rounds + 2, unit="round"
     ) as bar:
         measurement = _Measurement(plan, bar)
-        backends = measurement.measure_backends(host)
-        variants = measurement.measure_variants()
-    return BenchedScene(
-        size.gaussians, size.width, size.height, plan.sh_degree, backends, plan.backends[0],
-        variants)
+        backends = measurement.measure_backends()
+    return BenchedScene(size.gaussians, size.width, size.height, plan.sh_degree, backends)
 
 
 @contextmanager
@@ -219,43 +188,26 @@ class _Measurement:
         self._plan, self._bar = plan, bar
         self._scene = build_scene(plan.size, plan.sh_degree, plan.device)
         self._memory = {name: self._measure_memory(name) for name in plan.backends}
-        self._pairs: dict[str, Pairs] = dict.fromkeys(plan.backends)
         self._truth = oracle(self._scene)
         bar.advance()
 
-    def measure_backends(self, host: Host) -> dict[str, BackendResult]:
+    def measure_backends(self) -> dict[str, BackendResult]:
         """Returns speed and accuracy of every backend, all thread counts in turn."""
         plan, on_cpu = self._plan, self._plan.device == "cpu"
         counts = sorted({1, plan.threads}) if on_cpu else [plan.threads]
         samples = self._alternate({
             f"{name} {threads}": self._time_backend(name, threads)
             for threads in counts for name in plan.backends})
-        peak = host.peak_gflops if on_cpu else None
 
         def speed(name: str, threads: int) -> Speed:
-            return _compute_speed(samples[f"{name} {threads}"], self._pairs[name], peak, threads)
+            return Speed(threads, {part: Timing.from_samples(values) for part, values in samples[
+                f"{name} {threads}"].items()})
 
         return {
             name: BackendResult(
                 speed(name, plan.threads), speed(name, 1) if on_cpu else None,
-                self._accuracy(registry.renderer(name)), self._pairs[name], self._memory[name])
+                self._accuracy(registry.renderer(name)), self._memory[name])
             for name in plan.backends}
-
-    def measure_variants(self) -> list[VariantResult]:
-        """Returns time and accuracy of the contract and of every approximation, in turn."""
-        backend = self._plan.backends[0]
-        variants = [CONTRACT, *variants_for(backend, self._plan.sh_degree)]
-        renderers = {variant.name: renderer_of(variant, backend) for variant in variants}
-        with use_threads(self._plan.threads, backend):
-            samples = self._alternate({
-                name: partial(self._time, partial(_render_and_back, self._scene, renderer))
-                for name, renderer in renderers.items()})
-        return [
-            VariantResult(
-                variant.name,
-                Timing.from_samples(samples[variant.name]["whole"]),
-                self._accuracy(renderers[variant.name]))
-            for variant in variants]
 
     def _alternate(self, works: Mapping[str, Work]) -> dict[str, Samples]:
         return instruments.alternate(works, self._plan.rounds, self._bar.advance)
@@ -276,7 +228,7 @@ class _Measurement:
         return watch.ms
 
     def _time_backend(self, backend: str, threads: int) -> Work:
-        """Returns a function that times both passes and a step, and stores the pairs."""
+        """Returns a function that times both passes and a step."""
         step = training_step(self._scene, backend)
 
         def run() -> Mapping[str, float]:
@@ -296,7 +248,6 @@ class _Measurement:
             output.rgb.backward(self._scene.weights)  # type: ignore[no-untyped-call]
             watch.mark("backward")
             backward = probe.collect()
-        self._pairs[backend] = probe.pairs(output)
         return {**_parts("forward", watch.ms["forward"], forward),
                 **_parts("backward", watch.ms["backward"], backward)}
 
@@ -328,17 +279,3 @@ def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float
         times |= {f"{whole}: {part}": part_ms for part, part_ms in parts.items()}
         times[f"{whole}: rest"] = max(0.0, ms - sum(parts.values()))
     return times
-
-
-def _compute_speed(samples: Samples, pairs: Pairs, peak: float | None, threads: int) -> Speed:
-    """Returns medians and rates; those of pairs are of the compositing stages alone."""
-    times = {name: Timing.from_samples(values) for name, values in samples.items()}
-    inner = (times.get(f"forward: {instruments.COMPOSITE}"),
-             times.get(f"backward: {instruments.DECOMPOSE}"))
-    forward, backward = (
-        instruments.rate(pairs[i] if pairs else None, stage.ms if stage else None)
-        for i, stage in enumerate(inner))
-    return Speed(
-        threads, times, forward, backward,
-        instruments.peak_fraction(forward, instruments.FLOPS_FORWARD, peak, threads),
-        instruments.peak_fraction(backward, instruments.FLOPS_BACKWARD, peak, threads))

@@ -1,4 +1,4 @@
-"""The benchmark's synthetic room, approximations of the renderer, and errors against an oracle.
+"""The benchmark's synthetic room, and errors of renderers against an oracle.
 
 The oracle is the torch backend in float64, which the tests compare with an untiled brute force
 within 1e-12. All parameters are rounded to float32 before, so that only arithmetic is measured.
@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recon_cli.render import registry
-from recon_cli.render.contract import ALPHA_MIN, EXACT, Approximation, Renderer, RenderOutput
-from recon_cli.render.numba import backend as numba_backend
+from recon_cli.render.contract import Renderer
 from recon_cli.render.torch import tiles
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
@@ -96,49 +93,6 @@ def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Cam
     viewmat[:3, 3] = -viewmat[:3, :3] @ [1.0, 1.0, 1.6]
     focal = 0.85 * width
     return splats, Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
-
-
-@dataclass(frozen=True)
-class RendererVariant:
-    """A cheaper, or more careful, variant of the contract."""
-
-    name: str  # in the tables
-    approximation: Approximation = field(default=EXACT)  # of the rasterizer
-    sh_degree: int | None = None  # lower than that of the scene; None for the same
-
-
-CONTRACT = RendererVariant("contract")
-_ALL = (
-    RendererVariant("tiles by the 3-sigma square", Approximation(square=True)),
-    *(RendererVariant(f"stop at T < {value:g}", Approximation(transmittance_min=value))
-      for value in (1e-2, 1e-3, 1e-5)),
-    RendererVariant("no early stop", Approximation(transmittance_min=0.0)),
-    *(RendererVariant(f"alpha >= {name}", Approximation(alpha_min=factor * ALPHA_MIN))
-      for name, factor in (("4/255", 4.0), ("2/255", 2.0), ("1/510", 0.5), ("1/2550", 0.1))),
-    *(RendererVariant(f"SH degree {degree}", sh_degree=degree) for degree in (0, 1, 2)))
-
-
-def variants_for(backend: str, sh_degree: int) -> list[RendererVariant]:
-    """Returns the approximations that a backend can render of a scene with this SH degree."""
-    return [
-        variant for variant in _ALL
-        if (variant.approximation == EXACT or backend == "numba")
-        and (variant.sh_degree is None or variant.sh_degree < sh_degree)]
-
-
-def renderer_of(variant: RendererVariant, backend: str) -> Renderer:
-    """Returns a backend's render function with the variant's approximation built in."""
-    draw: Renderer = registry.renderer(backend) if variant.approximation == EXACT else partial(
-        numba_backend.render, approximation=variant.approximation)
-
-    def render(
-        splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
-        mask: Tensor | None = None,
-    ) -> RenderOutput:
-        degree = sh_degree if variant.sh_degree is None else variant.sh_degree
-        return draw(splats, camera, background, degree, scores, mask)
-
-    return render
 
 
 @dataclass(frozen=True, eq=False)

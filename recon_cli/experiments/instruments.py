@@ -1,7 +1,7 @@
-"""Measuring on this machine: clocks, timings in alternated rounds, memory, arithmetic peak.
+"""Measuring on this machine: clocks, timings in alternated rounds, memory.
 
-A probe takes the time of each stage of the numba backend and counts the evaluated pairs of Gaussian
-and pixel while it renders; it does not change the result.
+A probe takes the time of each stage of the numba backend while it renders; it does not change the
+result.
 """
 
 from __future__ import annotations
@@ -12,19 +12,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 import psutil
 import torch
 
 from recon_cli import machine
 from recon_cli.evaluation.scores import number
-from recon_cli.kernels.kernel import kernel
 from recon_cli.kernels.simd import LANES
-from recon_cli.kernels.simd_functions import fill, fma, store
 from recon_cli.kernels.thread_pool import pool
-from recon_cli.render.contract import RenderOutput
 
 # OpenMP's threads of the previous candidate keep spinning for some milliseconds after their work.
 _SETTLE_SECONDS = 0.03
@@ -125,7 +120,6 @@ class Host:
     cores: int  # that this process may use
     threads: int  # in use
     lanes: int  # float32 in a vector of the kernels
-    peak_gflops: float  # measured float32 multiply-adds of one thread; each counts as two
     device: str  # "cpu", or the GPU's model name
     versions: dict[str, str]  # of Python and the packages
 
@@ -134,16 +128,16 @@ class Host:
         """One line for the head of a table."""
         place = "" if self.device == "cpu" else f", {self.device}"
         return (
-            f"{self.cpu}{place}, {self.threads} of {self.cores} cores, {self.lanes} lanes, peak "
-            f"{self.peak_gflops:.0f} GFLOP/s a core, torch {self.versions['torch']}, "
+            f"{self.cpu}{place}, {self.threads} of {self.cores} cores, {self.lanes} lanes, "
+            f"torch {self.versions['torch']}, "
             f"numpy {self.versions['numpy']}, Python {self.versions['python']}")
 
 
 def examine(threads: int, device: str) -> Host:
-    """Returns this machine with its measured peak."""
+    """Returns this machine."""
     name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
     return Host(
-        machine.cpu_model(), machine.usable_threads(), threads, LANES, _measure_peak(), name,
+        machine.cpu_model(), machine.usable_threads(), threads, LANES, name,
         machine.versions())
 
 
@@ -177,66 +171,8 @@ def measure_memory(work: Callable[[], object], device: str) -> int:
     return added
 
 
-# Operations of an evaluated pair, forward and backward, counted in the inner loops of the
-# compositing kernels: a multiply-add is two, a division one; comparisons, selections, integer
-# operations and loads are none. As in docs/bench.md.
-OPERATIONS_PER_PAIR = {
-    "u, v, log2 alpha = log2 o - u^2 - v^2": (10, 10),
-    "2^x: reduction 3, polynomial of degree 5 by Estrin 11": (14, 14),
-    "weight alpha T; T (1 - alpha), T / (1 - alpha)": (3, 3),
-    "red, green, blue, depth composited, or their gradients summed": (8, 8),
-    "g . c, the slope g . c - R, s = alpha T slope": (0, 11),
-    "moments 1, u, v, uu, uv, vv of s": (0, 11),
-    "statistics: size of s along x and y, s^2, hits": (0, 8)}
-FLOPS_FORWARD = sum(forward for forward, _ in OPERATIONS_PER_PAIR.values())
-FLOPS_BACKWARD = sum(backward for _, backward in OPERATIONS_PER_PAIR.values())
-
-_CHAINS = 12  # independent: two units times a latency of 4 to 6 cycles
-_ITERATIONS = 2_000_000  # 3 ms on a core with AVX-512
-_ATTEMPTS = 9
-
-
-@kernel
-def _multiply_add(iterations: Any, out: Any) -> None:
-    x: Any = fill(0.999)
-    c: Any = fill(1.0)
-    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11 = c, c, c, c, c, c, c, c, c, c, c, c
-    for _ in range(iterations):
-        s0, s1, s2, s3 = fma(s0, x, c), fma(s1, x, c), fma(s2, x, c), fma(s3, x, c)
-        s4, s5, s6, s7 = fma(s4, x, c), fma(s5, x, c), fma(s6, x, c), fma(s7, x, c)
-        s8, s9, s10, s11 = fma(s8, x, c), fma(s9, x, c), fma(s10, x, c), fma(s11, x, c)
-    store(out, 0, s0 + s1 + s2 + s3 + s4 + s5 + s6 + s7 + s8 + s9 + s10 + s11)
-
-
-def _measure_peak() -> float:
-    """Returns the float32 GFLOP/s of one thread in multiply-adds alone, the best of several."""
-    out = np.empty(LANES, np.float32)
-    _multiply_add(1, out)  # compiles
-    seconds = []
-    for _ in range(_ATTEMPTS):
-        start = time.perf_counter()
-        _multiply_add(_ITERATIONS, out)
-        seconds.append(time.perf_counter() - start)
-    return 2e-9 * _ITERATIONS * _CHAINS * LANES / min(seconds)
-
-
-def rate(pairs: int | None, ms: float | None) -> float | None:
-    """Returns Gpairs/s; None where the pairs or their time are not known."""
-    return None if pairs is None or not ms else pairs / ms / 1e6
-
-
-def peak_fraction(
-    gpairs_per_s: float | None, flops: int, peak_gflops: float | None, threads: int
-) -> float | None:
-    """Returns the fraction of the peak of `threads` threads that the pairs' arithmetic takes."""
-    if gpairs_per_s is None or peak_gflops is None:
-        return None
-    return gpairs_per_s * flops / (peak_gflops * threads)
-
-
-COMPOSITE, DECOMPOSE = "composite", "decompose"  # the stages whose pairs are counted
 # names of kernels in the results on disk
-_STAGES = {"composite_backward": DECOMPOSE, "project_backward": "unproject"}
+_STAGES = {"composite_backward": "decompose", "project_backward": "unproject"}
 
 
 class Probe:
@@ -261,13 +197,6 @@ class Probe:
         """Returns the milliseconds since the last call and starts anew."""
         collected, self._ms = self._ms, {}
         return collected
-
-    def pairs(self, output: RenderOutput) -> tuple[int, int] | None:
-        """Returns pairs (forward, backward) of an output that has been through both passes."""
-        if not self._numba:
-            return None
-        view_pass = output.rgb.grad_fn.lease.view_pass  # type: ignore[union-attr]
-        return view_pass.pairs_forward, view_pass.pairs_backward
 
     def _add(self, kernel_name: str, seconds: float) -> None:
         stage = _STAGES.get(kernel_name, kernel_name)

@@ -15,14 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon_cli.errors import ConfigError, FormatError, InputError
+from recon_cli.errors import ConfigError, InputError
 from recon_cli.machine import install_command
 from recon_cli.workspace import atomic
 
 if TYPE_CHECKING:  # it imports scipy, for which `--help` must not wait
     from recon_cli.evaluation.scores import Table
 
-BEGIN, END = "<!-- recon bench: begin -->", "<!-- recon bench: end -->"
 
 logger = logging.getLogger("recon")
 
@@ -74,7 +73,6 @@ class OutputFiles:
 
     json_file: Path | None = None
     plot: Path | None = None
-    markdown: Path | None = None
 
     def check(self) -> None:
         """Raises ReconError unless all of them can be written."""
@@ -89,8 +87,6 @@ class OutputFiles:
         if self.plot is not None and not _can_draw():
             raise ConfigError("--plot needs matplotlib, which is not installed.",
                               hint=f"Run `{install_command('plot')}`.")
-        if self.markdown is not None:
-            _with_text(self.markdown, "")
 
     def write(self, result: Result) -> None:
         """Writes those that are wanted."""
@@ -98,9 +94,6 @@ class OutputFiles:
             atomic.write_json(self.json_file, result.record)
         if self.plot is not None and result.draw is not None:
             result.draw(self.plot)
-        if self.markdown is not None:
-            page = _with_text(self.markdown, result.markdown())
-            atomic.write_bytes(self.markdown, page.encode())
 
 
 def _can_draw() -> bool:
@@ -122,28 +115,3 @@ def add_legend(figure: Any, axes: Any) -> None:
     """Adds the legend of one panel below all of them."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
-
-
-def replace_between_marks(page: str, text: str) -> str:
-    """Returns the page with `text` between its two marks; ValueError if it lacks one."""
-    lines = page.splitlines()
-    begins = [i for i, line in enumerate(lines) if line.strip() == BEGIN]
-    ends = [i for i, line in enumerate(lines) if line.strip() == END]
-    if len(begins) != 1 or len(ends) != 1 or ends[0] < begins[0]:
-        raise ValueError("the marks are missing, repeated or out of order")
-    inner = ["", *text.strip("\n").splitlines(), ""]  # a table ends at a blank line
-    return "\n".join([*lines[: begins[0] + 1], *inner, *lines[ends[0] :]]) + "\n"
-
-
-def _with_text(path: Path, text: str) -> str:
-    """Returns the page at `path` with `text` between its marks."""
-    try:
-        return replace_between_marks(path.read_text(encoding="utf-8"), text)
-    except OSError as error:
-        raise FormatError(
-            f"{path} cannot be read: {error.strerror}.",
-            hint=f"Create it with the lines {BEGIN} and {END}.") from error
-    except ValueError as error:
-        raise FormatError(
-            f"{path} does not hold the lines {BEGIN} and {END}, once each and in this order.",
-            hint="Add both lines where the tables should stand.") from error

@@ -1,10 +1,10 @@
-"""`recon bench`: speed of the rasterizers against their error, as tables and as a picture."""
+"""`recon bench`: speed of the rasterizers and their error, as tables."""
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,13 @@ from recon_cli.experiments.bench_measure import (
 )
 from recon_cli.experiments.bench_scene import QUICK, SIZES, Accuracy
 from recon_cli.experiments.instruments import examine
-from recon_cli.experiments.outputs import OutputFiles, Result, drawing
+from recon_cli.experiments.outputs import OutputFiles, Result
 from recon_cli.progress import Progress
 from recon_cli.render import registry
 from recon_cli.workspace import atomic
 
 _ROUNDS, _QUICK_ROUNDS = 7, 2
 _REFERENCE = "torch"  # the other backends are compared with it
-_FLOOR = 1e-9  # for an error of zero on a logarithmic axis
 
 logger = logging.getLogger("recon")
 
@@ -103,9 +102,8 @@ def run(request: BenchRequest, progress: Progress) -> Result:
     plan = request.plan()
     old = request.earlier_record(plan)
     host = examine(plan.threads, plan.device)
-    benched = BenchResult(host, plan.rounds, {request.scene: measure(plan, host, progress)})
-    result = Result(benched.record(), head(benched), tables(benched),
-                    draw=lambda path: draw(benched, path))
+    benched = BenchResult(host, plan.rounds, {request.scene: measure(plan, progress)})
+    result = Result(benched.record(), head(benched), tables(benched))
     request.outputs.write(result)
     if old is None:
         return result
@@ -126,8 +124,7 @@ def _scene_tables(where: str, scene: BenchedScene) -> tuple[Table, ...]:
         ("backend", "ms", *_ERRORS),
         [(name, number(backend.speed.both_ms), *_accuracy_cells(backend.accuracy))
          for name, backend in scene.backends.items()], f"Error against float64 ({where})")
-    return (_figures(where, scene), _stages(where, scene), errors,
-            _variants(where, scene))
+    return _figures(where, scene), _stages(where, scene), errors
 
 
 def head(result: BenchResult) -> str:
@@ -156,9 +153,6 @@ def _figure_rows(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult
         return lambda backend: _ratio(
             speed(reference).both_ms, speed(backend).both_ms) if reference else "-"
 
-    def pairs(i: int) -> Callable[[BackendResult], str]:
-        return lambda backend: number(backend.pairs[i] / 1e6 if backend.pairs else None)
-
     several: list[tuple[str, Callable[[BackendResult], str]]] = [
         ("the same with 1 thread", speedup(_core)),
         (f"1 thread : {threads} threads, whole step", lambda backend: _ratio(
@@ -168,14 +162,6 @@ def _figure_rows(scene: BenchedScene) -> list[tuple[str, Callable[[BackendResult
         ("whole step, ms", lambda backend: backend.speed.times["step"].text()),
         (f"{_REFERENCE} : this, forward + backward", speedup(lambda backend: backend.speed)),
         *(several if _has_several(scene) else []),
-        ("Gpairs/s a core, forward", lambda backend: number(_core(backend).gpairs_per_s_forward)),
-        ("Gpairs/s a core, backward", lambda backend: number(_core(backend).gpairs_per_s_backward)),
-        ("of the core's peak, forward",
-         lambda backend: percent(_core(backend).peak_fraction_forward)),
-        ("of the core's peak, backward",
-         lambda backend: percent(_core(backend).peak_fraction_backward)),
-        ("evaluated Mpairs, forward", pairs(0)),
-        ("evaluated Mpairs, backward", pairs(1)),
         ("memory added, MB", lambda backend: f"{backend.memory_bytes / 1e6:.0f}")]
 
 
@@ -196,17 +182,11 @@ def _stages(where: str, scene: BenchedScene) -> Table:
     rows: list[tuple[str, ...]] = []
     for name, backend in scene.backends.items():
         core, speed = _core(backend), backend.speed
-        rates = {"forward: composite": (core.gpairs_per_s_forward, core.peak_fraction_forward),
-                 "backward: decompose": (core.gpairs_per_s_backward, core.peak_fraction_backward)}
-        for part in speed.times:
-            gpairs_per_s, fraction = rates.get(part, (None, None))
-            rows.append((
-                f"{name} {part}", *([core.times[part].text()] if several else []),
-                speed.times[part].text(),
-                *((number(gpairs_per_s), percent(fraction)) if part in rates else ("", ""))))
+        rows += [(f"{name} {part}", *([core.times[part].text()] if several else []),
+                  speed.times[part].text()) for part in speed.times]
     threads = next(iter(scene.backends.values())).speed.threads
     columns = ("ms, 1 thread", f"ms, {threads} threads") if several else ("ms",)
-    return Table(("stage", *columns, "Gpairs/s a core", "of peak"), rows, f"Stages ({where})")
+    return Table(("stage", *columns), rows, f"Stages ({where})")
 
 
 _ERRORS = ("image max", "image RMS", "pixels > 1e-5", "gradient rel.", "worst", "gradient 1 - cos")
@@ -217,82 +197,6 @@ def _accuracy_cells(accuracy: Accuracy) -> tuple[str, ...]:
     return (number(accuracy.image_error_max), number(accuracy.image_error_rms),
             percent(accuracy.flipped_pixels), number(accuracy.gradient_relative_error),
             accuracy.gradient_worst, number(1 - accuracy.gradient_cosine, 2))
-
-
-def _variants(where: str, scene: BenchedScene) -> Table:
-    """Returns every approximation against the oracle, and the time it saves."""
-    contract = scene.variants[0].time
-    rows = [(variant.name, variant.time.text(), number(contract.ms - variant.time.ms, 2),
-             *_accuracy_cells(variant.accuracy)) for variant in scene.variants]
-    return Table(("what", "ms", "ms saved", *_ERRORS), rows,
-                 f"Approximations on {scene.variants_of} ({where})")
-
-
-@dataclass(frozen=True)
-class SpeedErrorPoint:
-    """One point of the picture."""
-
-    name: str  # its label
-    ms: float  # forward and backward
-    image_error: float  # root mean square
-    gradient_error: float  # relative
-
-
-def list_points(scene: BenchedScene) -> list[SpeedErrorPoint]:
-    """Returns every backend, then every approximation that has a time."""
-    contract, *others = scene.variants
-    times = {name: backend.speed.both_ms for name, backend in scene.backends.items()}
-    times[scene.variants_of] = contract.time.ms  # taken in turn with the approximations
-    timed = [*((name, times[name], backend.accuracy) for name, backend in scene.backends.items()),
-             *((other.name, other.time.ms, other.accuracy) for other in others)]
-    return [SpeedErrorPoint(name, ms, accuracy.image_error_rms, accuracy.gradient_relative_error)
-            for name, ms, accuracy in timed]
-
-
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Returns the points (ms, error) that no other beats in both, by increasing milliseconds."""
-    best, front = float("inf"), []
-    for i in sorted(range(len(points)), key=lambda i: points[i]):
-        if points[i][1] < best:
-            best = points[i][1]
-            front.append(i)
-    return front
-
-
-def draw(result: BenchResult, path: Path) -> None:
-    """Draws speed against error of the first scene into a .png or .svg."""
-    name, scene = next(iter(result.scenes.items()))
-    points = list_points(scene)
-    with drawing(path, 15, 6, dpi=130) as figure:
-        left, right, names = figure.subplots(1, 3, width_ratios=(5, 5, 2))
-        figure.suptitle(
-            f"{name}: {scene.gaussians:,} Gaussians, {scene.width}x{scene.height}, "
-            f"{result.host.cpu}, threads: {result.host.threads}", fontsize=10)
-        count = len(scene.backends)
-        _scatter(left, [(point.ms, point.image_error) for point in points], count)
-        _scatter(right, [(point.ms, point.gradient_error) for point in points], count)
-        left.set_ylabel("image error against float64, RMS")
-        right.set_ylabel("gradient error against float64, relative")
-        lines = [f"{i}  {point.name}" for i, point in enumerate(points, start=1)]
-        names.text(0, 1, "\n".join(lines), va="top", fontsize=9, linespacing=1.6)
-        names.axis("off")
-
-
-def _scatter(axes: Any, places: Sequence[tuple[float, float]], backends: int) -> None:
-    """Draws numbered points, backends first, and their Pareto front."""
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
-
-    places = [(ms, max(error, _FLOOR)) for ms, error in places]
-    axes.plot(*zip(*(places[i] for i in pareto_front(places)), strict=True), color="0.7", zorder=1)
-    axes.scatter(*zip(*places, strict=True), zorder=2, s=16,
-                 c=["C1" if i < backends else "C0" for i in range(len(places))])
-    for index, place in enumerate(places, start=1):
-        axes.annotate(str(index), place, xytext=(4, 3), textcoords="offset points", fontsize=8)
-    axes.set(xscale="log", yscale="log", xlabel="forward + backward, ms")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.grid(color="0.92")
 
 
 def read_record(path: Path) -> Mapping[str, Any]:

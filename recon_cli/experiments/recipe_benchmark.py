@@ -104,10 +104,10 @@ def run(request: RecipeRequest, progress: Progress) -> Result:
     paths = check_scenes(request.scenes)
     runner = Runner(request.base, progress)
     with tempfile.TemporaryDirectory(prefix="recon-bench-") as scratch:
-        host, scenes = request.load(paths, Path(scratch), "validation", progress)
+        host, loading = request.load(paths, Path(scratch), "validation", progress)
         curves = CurvesResult(
             host, request.seeds, request.base, request.targets_db, request.recipes,
-            {loaded.folders.name: measure(loaded, request, runner) for loaded in scenes})
+            {loaded.folders.name: measure(loaded, request, runner) for loaded in list(loading)})
     result = Result(
         curves.record(), head(curves), tables(curves), draw=lambda path: draw(curves, path))
     request.outputs.write(result)

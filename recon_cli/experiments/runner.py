@@ -11,7 +11,7 @@ import dataclasses
 import json
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -81,13 +81,16 @@ class ExperimentRequest:
 
     def load(
         self, paths: Mapping[str, Path], scratch: Path, split: str, progress: Progress
-    ) -> tuple[Host, list[LoadedScene]]:
-        """Returns this machine and the scenes; data sets become workspaces in `scratch`."""
+    ) -> tuple[Host, Iterator[LoadedScene]]:
+        """Returns this machine and the scenes, each loaded when it is asked for.
+
+        Data sets become workspaces in `scratch`.
+        """
         ctx = render_context(self.compute, progress)
         host = examine(ctx.threads, ctx.device)
-        return host, [load_for_training(
+        return host, (load_for_training(
             open_scene(name, path, scratch, self.settings, self.compute, progress), split,
-            self.base, ctx) for name, path in paths.items()]
+            self.base, ctx) for name, path in paths.items())
 
 
 def base_config(

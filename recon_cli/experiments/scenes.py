@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -66,7 +67,7 @@ def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
             hint="Give workspaces with cameras or data sets with poses after --scenes.")
     scenes: dict[str, Path] = {}
     for path in paths:
-        name = path.resolve().name
+        name = Path(os.path.abspath(path)).name  # a link has the name of the scene, not its target
         if name in scenes:
             raise ConfigError(
                 f"{scenes[name]} and {path} are both called {name}.",

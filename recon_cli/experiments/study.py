@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 import statistics
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -186,10 +187,10 @@ def run(request: StudyRequest, progress: Progress) -> Result:
     with (disk_errors(out, "running study"),
           hold_lock(out, "study", other="another folder with --out")):
         records = Records(out)
-        host, scenes = request.load(paths, out / "scenes", "test", progress)
+        host, loading = request.load(paths, out / "scenes", "test", progress)
         machine = f"{host.cpu}, {host.device}, {host.threads} threads"
         study = Study(request, records, progress, machine)
-        logger.warning("%s", study.announcement(scenes))
+        scenes = study.load(loading, len(paths))
         studied = StudyResult(
             host, request.seeds, request.base, request.clock,
             {loaded.folders.name: study.run_scene(loaded) for loaded in scenes},
@@ -231,28 +232,44 @@ class Study:
         self._runner = Runner(request.base, progress, machine, records)
         self._variants = request.design.variants
 
-    def announcement(self, scenes: list[LoadedScene]) -> str:
-        """Returns a sentence about how many runs are missing and how long they will take."""
-        seconds, missing = 0.0, 0
-        seeds, iterations = self._request.seeds, self._request.iterations
-        for loaded in scenes:
+    def load(self, loading: Iterable[LoadedScene], count: int) -> list[LoadedScene]:
+        """Returns all of `count` scenes, and says how many runs are missing.
+
+        To make cameras for a scene takes minutes, so how long all will take is said as soon as the
+        first scene with missing runs is there.
+        """
+        each = len(self._request.design.comparisons) * len(self._variants) * self._request.seeds
+        logger.warning("at most %d runs of about %s steps; their time is estimated on the first "
+                       "scene", count * each, f"{self._request.iterations:,}")
+        scenes, missing, start = list[LoadedScene](), 0, time.monotonic()
+        for loaded in loading:
+            scenes.append(loaded)
             counts = {variant.name: self._count_missing(loaded, variant)
                       for variant in self._variants}
+            if any(counts.values()) and not missing:
+                ahead = count - len(scenes)
+                seconds = (ahead * (time.monotonic() - start) / len(scenes)
+                           + (ahead + 1) * self._estimate_seconds(loaded, counts))
+                logger.warning("about %s minutes for all, by short runs on %s",
+                               f"{max(1, round(seconds / 60)):,}", loaded.folders.name)
             missing += sum(counts.values())
-            if any(counts.values()):
-                costs = {name: iterations * step for name, step in
-                         self._runner.pilot_seconds(
-                             loaded, self._variants, most=iterations).items()}
-                loaded.release()
-                seconds += sum(
-                    costs[name] * min(count, seeds) + max(costs.values()) * max(0, count - seeds)
-                    for name, count in counts.items())
-        recorded = len(scenes) * len(self._request.design.comparisons) * len(
-            self._variants) * seeds - missing
-        if not missing:
-            return f"all {recorded} runs are kept from before"
-        return (f"about {missing} runs are to be made, {recorded} are kept from before; about "
-                f"{max(1, round(seconds / 60))} minutes")
+        recorded = count * each - missing
+        if missing:
+            logger.warning(
+                "about %d runs are to be made, %d are kept from before", missing, recorded)
+        else:
+            logger.warning("all %d runs are kept from before", recorded)
+        return scenes
+
+    def _estimate_seconds(self, loaded: LoadedScene, counts: Mapping[str, int]) -> float:
+        """Returns how long so many runs of each variant take on a scene."""
+        seeds, iterations = self._request.seeds, self._request.iterations
+        steps = self._runner.pilot_seconds(loaded, self._variants, most=iterations)
+        loaded.release()
+        slowest = max(steps.values())
+        return iterations * sum(
+            steps[name] * min(count, seeds) + slowest * max(0, count - seeds)
+            for name, count in counts.items())
 
     def _count_missing(self, loaded: LoadedScene, variant: Variant) -> int:
         """Returns how many runs of a variant are missing; those of unknown steps are, too."""

@@ -103,7 +103,8 @@ def convert(request: ConvertRequest, ctx: StageContext) -> Converted:
     with tempfile.TemporaryDirectory(dir=folder, prefix=".recon-convert-") as scratch:
         path = Path(scratch) / request.out.name
         gain = _write(row, path, splats, settings, request, checked)
-        size = file_size(row, path)
+        # formats hold the backdrop as Gaussians, as many as their greatest scale needs
+        size, count = file_size(row, path), len(FORMATS[row.name].read(path).with_sphere())
         if row.name == "lod":
             discard_levels(request.out)
             for part in path.parent.iterdir():
@@ -111,7 +112,7 @@ def convert(request: ConvertRequest, ctx: StageContext) -> Converted:
                     durable.rename(part, folder / part.name)
         durable.replace(path, request.out)
     sync_folder(folder)
-    return Converted(str(request.out), len(splats), splats.sh_degree, size, round(gain, 4))
+    return Converted(str(request.out), count, splats.sh_degree, size, round(gain, 4))
 
 
 def _check_out(request: ConvertRequest) -> ExportFormat:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -66,7 +67,7 @@ class FileFindings:
             "": self.file,
             "format": f"{self.format}, {self.bytes / 1e6:.2f} MB",
             "Gaussians": f"{self.gaussians:,}, degree {self.sh_degree}"
-            + (", and a backdrop" if self.backdrop else ""),
+            + (", the last of them the backdrop" if self.backdrop else ""),
             "up": self.up or "not stated",
             "writer": self.writer or "not stated",
             "bounds": _box(self.bounds),
@@ -100,7 +101,7 @@ def describe_file(path: Path, ctx: StageContext) -> FileFindings:
     problems += _find_problems(scene, radius, (low, high), overdraw)
     return FileFindings(
         file=str(path), format=format_of(path).name, bytes=path.stat().st_size,
-        gaussians=len(splats), sh_degree=splats.sh_degree, up=scene.up,
+        gaussians=len(splats.with_sphere()), sh_degree=splats.sh_degree, up=scene.up,
         writer=_printable(scene.writer), antialiased=scene.antialiased,
         backdrop=splats.backdrop is not None,
         bounds=_corners(means.amin(dim=0) + shift, means.amax(dim=0) + shift),
@@ -137,7 +138,9 @@ def _find_problems(
     means, lengths = splats.means.double(), splats.quats.double().norm(dim=1)
     flat = int((splats.log_scales <= FLAT + 1e-3).any(dim=1).sum())
     if flat:
-        found.append(f"{flat:,} of {count} Gaussians have a scale of 0")
+        # readers put small values in place of a 0, and trained ones may be as small
+        found.append(f"{flat:,} of {count} Gaussians are flat: a scale is at most "
+                     f"{math.exp(FLAT):.0e} units")
     none = int((lengths == 0).sum())  # other lengths than 1 are usual, and every viewer mends them
     if none:
         found.append(f"{none:,} of {count} rotations are 0 0 0 0, which some viewers do not draw")

@@ -12,7 +12,7 @@ import numpy as np
 from recon_cli.config.export import ExportConfig
 from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.export.camera_files import write_cameras
-from recon_cli.export.reduce import lower_degrees
+from recon_cli.export.reduce import ReducedScene, lower_degrees
 from recon_cli.export.source import ExportSource
 from recon_cli.export.verify import file_size, measure_size, write_until_good
 from recon_cli.io.mesh_data import Mesh, joined
@@ -51,11 +51,12 @@ class FormatWriter:
     """Writes a scene, whose .ply exists already, in one format after the other."""
 
     def __init__(
-        self, splats: Splats, out: Path, config: ExportConfig, source: ExportSource,
+        self, scene: ReducedScene, out: Path, config: ExportConfig, source: ExportSource,
         room_frame: RoomFrame | None,
     ) -> None:
-        self._splats, self._out, self._config = splats, out, config
+        self._scene, self._out, self._config = scene, out, config
         self._source, self._room_frame = source, room_frame
+        self._known_db: dict[bool, float] = {}  # of the bounded scene and the other one
 
     def write(self, row: ExportFormat) -> ExportedFile:
         """Writes one format; ReconstructionError if it loses more than it may."""
@@ -63,8 +64,9 @@ class FormatWriter:
             case "gaussians":
                 return self._write_gaussians(row)
             case "points":
-                inside = self._splats.within(*self._source.room)
-                write_points(self._out / row.file, self._splats.select(inside))
+                trained = self._scene.trained
+                inside = trained.within(*self._source.room)
+                write_points(self._out / row.file, trained.select(inside))
             case "cameras":
                 write_cameras(self._out, row, self._source)
             case "mesh":
@@ -78,17 +80,19 @@ class FormatWriter:
         return ExportedFile(file=row.file, bytes=path.stat().st_size if path.is_file() else None)
 
     def _write_gaussians(self, row: ExportFormat) -> ExportedFile:
-        path = self._out / row.file
+        path, scene = self._out / row.file, self._scene
+        splats = scene.bounded if row.bounded else scene.trained
+        before = self._psnr_db(splats, bounded=row.bounded)
         limit = loss_limit(row.name, dataclasses.asdict(self._config))
         limited = self._config.max_mb is not None and row.name == self._config.formats[0]
         gain = write_until_good(
-            row, path, lower_degrees(self._splats, self._source).at(row.sh_degree),
+            row, path, lower_degrees(splats, self._source).at(row.sh_degree),
             _settings(row, self._config, self._source), self._source.psnr,
-            reference_db=self._psnr_db, limit=limit,
+            reference_db=before, limit=limit,
             max_bytes=int(1e6 * (self._config.max_mb or 0)) if limited else None)
         size, ply_size = file_size(row, path), (self._out / "splats.ply").stat().st_size
         text = f"{row.name}: {ply_size / size:.1f}x smaller, {gain:+.2f} dB"
-        if not limit.allows(gain, self._psnr_db + gain):
+        if not limit.allows(gain, before + gain):
             raise ReconstructionError(
                 f"{text} on {self._source.psnr.describe()}, but it may lose {limit.most_db:g} dB "
                 "at most.",
@@ -96,7 +100,7 @@ class FormatWriter:
         logger.info("%s", text)
         return ExportedFile(
             file=row.file, bytes=size, smaller=round(ply_size / size, 3),
-            psnr_change_db=round(gain, 4), psnr_db=round(self._psnr_db + gain, 4))
+            psnr_change_db=round(gain, 4), psnr_db=round(before + gain, 4))
 
     def _write_mesh(self, row: ExportFormat) -> ExportedFile:
         mesh = self._textured if "texture" in row.options and self._config.texture else (
@@ -110,17 +114,18 @@ class FormatWriter:
                     f"{text}; {share:.1%} of the area is inferred from planes")
         return ExportedFile(file=row.file, bytes=path.stat().st_size, inferred_share=share)
 
-    @cached_property
-    def _psnr_db(self) -> float:
-        """PSNR of the scene, which that of all files is compared with."""
-        return self._source.psnr.psnr_db(self._splats)
+    def _psnr_db(self, splats: Splats, *, bounded: bool) -> float:
+        """Returns the PSNR of one of both scenes, which that of its files is compared with."""
+        if bounded not in self._known_db:
+            self._known_db[bounded] = self._source.psnr.psnr_db(splats)
+        return self._known_db[bounded]
 
     @cached_property
     def _mesh(self) -> MeshResult:
         """The mesh of all formats that have it, measured if there is a plan."""
         source, measured = self._source, self._room_frame is not None
         return build_mesh(
-            self._splats.map(lambda tensor: tensor.to(source.ctx.device)),
+            self._scene.trained.map(lambda tensor: tensor.to(source.ctx.device)),
             source.load_training_with_depth(), source.points if measured else None, source.ctx,
             max_triangles=self._config.max_triangles, voxel=self._config.voxel,
             infer=self._config.inferred != "off")

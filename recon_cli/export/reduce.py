@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.importance import Importance, add_views
+from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.export_record import ExportChange
 
 if TYPE_CHECKING:  # the readers of views, which `recon convert` starts without
@@ -37,13 +38,23 @@ _SHRINK = 0.99  # of the count at most, from one attempt to the next
 logger = logging.getLogger("recon")
 
 
+@dataclass(frozen=True, eq=False)
+class ReducedScene:
+    """A scene after the options that remove something."""
+
+    bounded: Splats  # in files for viewers and engines
+    trained: Splats  # in all others, with what lies outside the room where it was trained
+    changes: tuple[ExportChange, ...]
+
+
 def reduce_scene(
     splats: Splats, config: ExportConfig, source: ExportSource, size_of: Callable[[Splats], int]
-) -> tuple[Splats, list[ExportChange]]:
+) -> ReducedScene:
     """Returns the scene after the options that remove something, in order, and the changes.
 
     Floaters and islands come before --crop: it removes the background.
-    `size_of` measures the file that --max-mb limits. ConfigError if nothing would be left.
+    `size_of` measures the file that --max-mb limits. Where that is bounded, so are all others.
+    ConfigError if nothing would be left.
     """
     changes: list[ExportChange] = []
 
@@ -51,23 +62,34 @@ def reduce_scene(
         changes.append(measure_change(option, splats, after, source.psnr.psnr_db))
         return after
 
+    def bound() -> Splats:
+        bounded = source.bound(splats) if source.has_views else splats
+        return splats if bounded is splats else step("backdrop", bounded)
+
     if config.drop_floaters:
         splats = step("drop_floaters", drop_floaters(splats, source.load_training(), source.ctx))
     if config.drop_islands:
         views = source.load_training() if source.has_views else None
         splats = step("drop_islands", drop_islands(splats, source.room, views, source.ctx))
-    if config.drop_backdrop:
-        splats = step("drop_backdrop", replace(splats, backdrop=None))
+    if config.backdrop == "drop":
+        splats = step("backdrop", replace(splats, backdrop=None))
     if config.crop is not None:
         splats = step("crop", crop(splats, config.crop))
     if config.sh_degree is not None and config.sh_degree < splats.sh_degree:
         splats = step("sh_degree", lower_degrees(splats, source).at(config.sh_degree))
+    bounds = config.backdrop == "bounded"
+    first = EXPORT_FORMATS[config.formats[0]].bounded
+    if bounds and config.max_mb is not None and first:
+        splats = bound()
     if config.max_mb is not None:
         splats = step("max_mb", fit_to_size(
             splats, int(1e6 * config.max_mb), size_of=size_of,
             fewer=_HighestScores(splats, source).take, at_degree=lower_degrees(splats, source).at,
             psnr_db=source.psnr.psnr_db))
-    return splats, changes
+    trained = splats
+    if bounds and not (config.max_mb is not None and first):
+        splats = bound()
+    return ReducedScene(splats, trained, tuple(changes))
 
 
 class _HighestScores:
@@ -98,10 +120,11 @@ def measure_change(
 ) -> ExportChange:
     """Returns and logs how many Gaussians and dB an option has removed."""
     change = ExportChange(
-        option=option, gaussians=len(after), gaussians_before=len(before),
+        option=option, gaussians=len(after.with_sphere()),
+        gaussians_before=len(before.with_sphere()),
         degree=after.sh_degree, degree_before=before.sh_degree,
         psnr_change_db=round(psnr_db(after) - psnr_db(before), 4))
-    text = f"{option}: {len(after):,} of {len(before):,} Gaussians"
+    text = f"{option}: {change.gaussians:,} of {change.gaussians_before:,} Gaussians"
     if change.degree != change.degree_before:
         text += f", degree {change.degree_before} -> {change.degree}"
     logger.info("%s, %+.2f dB", text, change.psnr_change_db)

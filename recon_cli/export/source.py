@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.export.bounds import SIZE, VIEWS, Room, bound_scene
 from recon_cli.export.coordinate_frame import ExportFrame
 from recon_cli.export.page import make_guide
 from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
+from recon_cli.io.images import fit_camera
 from recon_cli.io.sensor_depth import ALL_SAMPLES, read_sensor_depth
 from recon_cli.io.training_scene import load_scene
-from recon_cli.io.views import ReferenceView
+from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.scene.splats import Splats, transformed
@@ -132,6 +134,13 @@ class ExportSource:
     def ingest(self) -> Path:
         """The folder of ingest."""
         return self._inputs.folders["ingest"]
+
+    def bound(self, splats: Splats) -> Splats:
+        """Returns a scene of the files that reaches little farther than its room."""
+        cameras = np.stack([camera.center for _, camera in self.place(self.scene.train)])
+        views = [fit_camera(self._similarity.camera(view.camera), SIZE)
+                 for view in evenly_spread(self.scene.train, VIEWS)]
+        return bound_scene(splats, Room.from_points(self.points, cameras), views, self.ctx)
 
     @property
     def room(self) -> tuple[list[float], float]:

@@ -30,19 +30,6 @@ DILATION = 0.3  # pixels^2 added to the projected covariance: the low-pass filte
 NEAR = 0.05  # world units; COLMAP's scenes measure about ten units across
 
 
-@dataclass(frozen=True)
-class Approximation:
-    """Where an image may be cheaper than exact. The defaults are the contract."""
-
-    alpha_min: float = ALPHA_MIN  # fragments below it are dropped
-    transmittance_min: float = TRANSMITTANCE_MIN  # a pixel stops before it falls below; 0: never
-    # Tiles by the square of 3 standard deviations of the longer axis (INRIA), not by the ellipse.
-    square: bool = False
-
-
-EXACT = Approximation()
-
-
 @dataclass(frozen=True, eq=False)
 class EllipseGradients:
     """Gradients of a loss by what M Gaussians are projected to; see `render.view_gradient`."""

@@ -1,7 +1,6 @@
 """The gradient of a loss for every number of a camera, from what a backend sums for each ellipse.
 
-The projection of the Gaussians that were drawn is computed once more, by autograd in float64. With
-`camera_gradient` the motion of a camera costs less; this is for whoever optimizes matrices.
+The projection of the Gaussians that were drawn is computed once more, by autograd in float64.
 """
 
 from __future__ import annotations

@@ -57,8 +57,9 @@ class MeshResult:
 
     def describe(self) -> str:
         """Returns triangles and voxels as part of a sentence."""
-        count = f"{len(self.mesh.faces):,} triangles"
-        if self.triangles_before > len(self.mesh.faces):
+        triangles = len(self.mesh.faces) + (len(self.inferred.faces) if self.inferred else 0)
+        count = f"{triangles:,} triangles"
+        if self.triangles_before > triangles:
             count += f" of {self.triangles_before:,}"
         return f"{count}, made in voxels of {self.voxel:.3g} units"
 
@@ -75,7 +76,7 @@ def build_mesh(
         points: [P, 3] triangulated points, which confirm the planes that a room is measured by;
             None if it is not measured.
         ctx: backend, threads, progress, and notices.
-        max_triangles: that are left.
+        max_triangles: at most, of what views show and what closes holes together.
         voxel: side of a voxel in world units; None for 1/128 of the median depth.
         infer: whether to close holes in large planes.
 
@@ -119,13 +120,12 @@ def mesh_of(
         raise ReconstructionError(
             f"Of {before:,} triangles none is left at --max-triangles {max_triangles}.",
             hint="Allow more.")
-    _, colors = observe_all(maps, vertices, faces)
-    mesh = Mesh(vertices, faces, _fill(vertices, colors))
+    mesh = Mesh(vertices, faces, np.zeros((len(vertices), 3), np.uint8))
     inferred = infer_surface(mesh, maps, voxel) if infer else None
     if inferred is not None:
-        _, sums = observe_all(maps, inferred.vertices, inferred.faces)
-        inferred = replace(inferred, colors=_fill(inferred.vertices, sums))
-    return MeshResult(mesh, voxel, before, planes, inferred)
+        mesh, inferred = _simplify_together(mesh, inferred, max_triangles, ctx.threads)
+    return MeshResult(
+        _paint(mesh, maps), voxel, before, planes, inferred and _paint(inferred, maps))
 
 
 def _fit_voxel(
@@ -187,6 +187,29 @@ def _used(
                   & (faces[:, 2] != faces[:, 0])]
     rows, inverse = np.unique(faces, return_inverse=True)
     return vertices[rows], inverse.reshape(faces.shape).astype(np.int64)
+
+
+def _simplify_together(
+    mesh: Mesh, inferred: Mesh, most: int, threads: int
+) -> tuple[Mesh, Mesh | None]:
+    """Returns both with at most `most` triangles together, shared out by their areas."""
+    if len(mesh.faces) + len(inferred.faces) <= most:
+        return mesh, inferred
+    share = mesh.area() / (mesh.area() + inferred.area())
+    count = min(max(int(share * most), 1), most - 1)
+    parts = [_used(*simplify(part.vertices, part.faces, allowed, threads))
+             for part, allowed in ((mesh, count), (inferred, most - count))]
+    if not all(len(faces) for _, faces in parts):
+        return mesh, None
+    simple, closing = (
+        Mesh(vertices, faces, np.zeros((len(vertices), 3), np.uint8)) for vertices, faces in parts)
+    return simple, replace(closing, inferred=np.ones(len(closing.vertices), bool))
+
+
+def _paint(mesh: Mesh, maps: DepthMaps) -> Mesh:
+    """Returns a mesh in the colours that views show."""
+    _, sums = observe_all(maps, mesh.vertices, mesh.faces)
+    return replace(mesh, colors=_fill(mesh.vertices, sums))
 
 
 def _fill(vertices: NDArray[np.float64], sums: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 import torch
@@ -55,30 +54,6 @@ def rotation_blocks(rotation: NDArray[np.float64]) -> tuple[Tensor, ...]:
         rows = slice(degree * degree - 1, (degree + 1) ** 2 - 1)
         blocks.append(torch.linalg.lstsq(after[:, rows], before[:, rows]).solution)
     return tuple(blocks)
-
-
-@cache
-@torch.enable_grad()
-def generators() -> Tensor:
-    """Returns the matrices [3, 15, 15] of small turns about x, y and z, float64.
-
-    A turn by the small rotation vector w changes coefficients c of degrees 1 to 3 by
-    sum_i w_i (G_i c): with Y the row of basis functions, Y(R d) (c + w_i G_i c) = Y(d) c demands
-    Y(d) G_i = -dY(R d)/dw_i, solved as in `rotation_blocks`. Antisymmetric; 48 entries are not 0.
-    Those are half the square roots of integers, as of every angular momentum, and are rounded
-    to that: the last bits of a least-squares solution depend on the number of threads.
-    """
-    directions, matrices = _lattice(_DIRECTIONS).requires_grad_(), []
-    basis = basis_rest(directions, _DEGREE)
-    slopes = torch.stack([
-        torch.autograd.grad(function.sum(), directions, retain_graph=True)[0]
-        for function in basis.T])  # [15, directions, 3]
-    for axis in torch.eye(3, dtype=torch.float64):
-        turn = torch.linalg.cross(axis.expand_as(directions), directions.detach())
-        solved = torch.linalg.lstsq(basis.detach(), -(slopes * turn).sum(dim=2).T).solution
-        # + 0.0 takes the sign of zeros away, which is that of the rounding errors
-        matrices.append(solved.sign() * (4 * solved.square()).round().sqrt() / 2 + 0.0)
-    return torch.stack(matrices)
 
 
 def rotate_sh(sh_rest: Tensor, rotation: NDArray[np.float64]) -> Tensor:

@@ -19,7 +19,7 @@ from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconError, ReconstructionError, StageError, WorkspaceError
 from recon_cli.evaluation.reference_views import RenderedModel
-from recon_cli.export.bounds import describe_bounds
+from recon_cli.export.bounds import describe_bounds, describe_loss
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
 from recon_cli.export.format_writer import FormatWriter, measure_first
 from recon_cli.export.kept_files import (
@@ -77,11 +77,11 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     fresh = find_fresh(config, inputs, records)
     antialiased = not pruned and _is_antialiased(inputs.folders["train"])
     source = ExportSource(splats, inputs, frame, ctx, antialiased=antialiased)
-    splats, changes = reduce_scene(
+    reduced = reduce_scene(
         splats, config, source, partial(measure_first, config=config, source=source))
-    far = describe_bounds(splats)
-    if far:
-        ctx.notice(far)
+    splats = reduced.bounded
+    for text in filter(None, (describe_bounds(splats), describe_loss(reduced.changes))):
+        ctx.notice(text)
     path = out / "splats.ply"
     others = [name for name in config.formats if name != "ply" and name not in fresh]
     with ctx.progress.bar("export", 2 + len(others), unit="file") as bar:
@@ -90,7 +90,7 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
         bar.advance()
         verify_ply(path, splats)
         bar.advance()
-        writer = FormatWriter(splats, out, config, source, room_frame)
+        writer = FormatWriter(reduced, out, config, source, room_frame)
         files, failed = _write_formats(others, writer, out, config, bar.advance)
     record = ImportRecord.read(inputs.folders["train"])
     _write_transform(out / TRANSFORM, frame, record.origin if record else None)
@@ -101,9 +101,9 @@ def run(config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext)
     for text in notices:
         ctx.notice(text)
     return ExportSummary(
-        model=model, file=path.name, gaussians=len(splats),
+        model=model, file=path.name, gaussians=len(splats.with_sphere()),
         bytes=path.stat().st_size, transform=frame.similarity.to_json(),
-        changes=tuple(changes) or None, files={**files, **kept.files} or None,
+        changes=reduced.changes or None, files={**files, **kept.files} or None,
         limited=limited_format(dataclasses.asdict(config)), failed=failed or None,
         own_files=kept.own_files or None, notices=notices or None)
 
@@ -162,7 +162,7 @@ def _expected_errors(
             RenderedModel(trained.map(lambda tensor: tensor.to(ctx.device)), run_config.sh_degree,
                           ctx.backend), scene, run_config, run_config.max_size, ctx, bar.advance))
     rows = match_rows(splats.means, frame.similarity.points(trained.means.double().numpy()))
-    return {PLY_PROPERTY: errors[rows]}
+    return {PLY_PROPERTY: np.where(rows < 0, errors.max(), errors[rows])}
 
 
 def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:

@@ -13,6 +13,7 @@ from recon_cli.trust.scene_trust import Trust
 from recon_cli.trust.support import Sight
 
 PLY_PROPERTY = "expected_error"
+_ROUNDING = 1e-6  # of the greatest coordinate: float32 moves centres by less
 
 
 def expected_errors(splats: Splats, trust: Trust) -> NDArray[np.float32]:
@@ -28,8 +29,11 @@ def expected_errors(splats: Splats, trust: Trust) -> NDArray[np.float32]:
 
 
 def match_rows(means: Tensor, originals: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Returns for each of `means` [K, 3] the row of the nearest original [N, 3], [K].
+    """Returns for each of `means` [K, 3] the row of the original [N, 3] in its place, [K].
 
-    What export removes, orders or moves leaves the centres of the rest in place.
+    Export removes and orders them, which leaves the rest in place; -1 for one that it moves, as
+    what lies outside the room.
     """
-    return np.asarray(cKDTree(originals).query(means.detach().cpu().double().numpy())[1], np.int64)
+    places = means.detach().cpu().double().numpy()
+    apart, rows = cKDTree(originals).query(places)
+    return np.where(apart <= _ROUNDING * np.abs(places).max(initial=1.0), rows, -1)

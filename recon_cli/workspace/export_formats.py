@@ -45,6 +45,7 @@ class ExportFormat:
     # pattern of the first bytes of its files, by which they are known whatever their name; None
     # where a file has nothing to know it by
     signature: re.Pattern[bytes] | None = None
+    bounded: bool = True  # it holds the scene with `export.bounds`; False: as it was trained
 
     @property
     def patterns(self) -> tuple[str, ...]:
@@ -82,7 +83,7 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("glb", "gaussians", "splats.glb", "recon_cli.splats.glb",
                  signature=_starts(b"glTF")),
     ExportFormat("html", "gaussians", "splats.html", "recon_cli.splats.html", more_files=(
-        "splats.jpg",), options=("title", "credits"),
+        "splats.jpg",), options=("title", "credits"), bounded=False,
                  signature=_starts(rb"\s*(?i:<!doctype html|<html)")),
     ExportFormat("lod", "gaussians", "lod/lod-meta.json", "recon_cli.splats.lod", more_files=(
         "lod/*",), options=("max_loss",), sharing=_SHARING,

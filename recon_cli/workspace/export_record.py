@@ -23,7 +23,7 @@ from recon_cli.workspace.summaries import JsonRecord
 CLEAN_DB = 45.0
 VERSION = 6  # of the stage; goes up when the meaning of a file changes, and makes the others stale
 _FRAME = ("scale_between", "transform", "up")
-_SCENE = (*_FRAME, "crop", "drop_floaters", "drop_islands", "drop_backdrop", "sh_degree", "max_mb")
+_SCENE = (*_FRAME, "crop", "drop_floaters", "drop_islands", "backdrop", "sh_degree", "max_mb")
 _EARLIER = {"ingest": "other frames", "sfm": "earlier cameras", "train": "an earlier training",
             "prune": "an earlier pruning"}
 

@@ -4,11 +4,16 @@
 Gaussians that go, by kind, and the PSNR on the validation views; then the same of the scene with 60
 floaters planted on lines of sight of training views, at 15 to 60% of the way to the surface, and
 with an island of 60 Gaussians planted where there is most space.
+
+With `--bounds` a table instead: the bounding sphere of a file over that of its room, and the PSNR
+that bounds of 3, 10 and 30 times the room and no backdrop cost on all views.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import click
@@ -16,11 +21,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from workbench import open_trained, workspaces_argument
+from workbench import open_trained, print_head, print_row, workspaces_argument
 
 from recon_cli.context import StageContext
+from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr
+from recon_cli.export import bounds
 from recon_cli.export.cleanup import count_sightings, find_floaters, find_islands
 from recon_cli.export.verify import load_reference_psnr
+from recon_cli.io.images import fit_camera
+from recon_cli.io.views import evenly_spread
 from recon_cli.render import render
 from recon_cli.render.registry import resolve
 from recon_cli.scene.scene import Scene
@@ -73,12 +82,46 @@ def emptiest(splats: Splats, scene: Scene, draw: np.random.Generator) -> NDArray
     return np.asarray(places[cKDTree(splats.means.numpy()).query(places)[0].argmax()])
 
 
+def print_bounds(workspaces: tuple[Path, ...], ctx: StageContext) -> None:
+    """Prints what bounds cost: a row for each workspace and bound."""
+    print_head("scene", "far", "bound", "Gaussians", "sphere / room", "all views dB", "change dB",
+               "seconds")
+    for root in workspaces:
+        config, scene, splats = open_trained(root)
+        views = load_reference_views(
+            [*scene.train, *scene.validation, *scene.test], config.max_size)
+        cameras = [fit_camera(view.camera, bounds.SIZE)
+                   for view in evenly_spread(scene.train, bounds.VIEWS)]
+        room = bounds.Room.from_points(
+            scene.points, np.stack([view.camera.center for view in scene.train]))
+        inside = splats.means.double()[splats.within(room.center.tolist(), room.radius)]
+        before = mean_psnr(splats, views, splats.sh_degree, ctx.backend)
+        for name, make in (
+                ("keep", lambda scene=splats: scene.with_sphere()),
+                *((f"{most:g} rooms", partial(
+                    bounds.bound_scene, splats, room, cameras, ctx, most=most))
+                  for most in (30.0, 10.0, bounds.MOST_SPHERES)),
+                ("drop", partial(replace, splats, backdrop=None))):
+            begin = time.perf_counter()
+            bounded = make()
+            seconds = time.perf_counter() - begin
+            after = mean_psnr(bounded, views, bounded.sh_degree, ctx.backend)
+            ratio = (bounds.bounding_sphere(bounded.means.double())
+                     / bounds.bounding_sphere(inside))
+            print_row(root.name, config.far, name, f"{len(bounded):,}", f"{ratio:.1f}",
+                      f"{after:.2f}", f"{after - before:+.2f}", f"{seconds:.1f}")
+
+
 @click.command()
+@click.option("--bounds", "only_bounds", is_flag=True, help="Print what bounds cost instead.")
 @workspaces_argument
-def main(workspaces: tuple[Path, ...]) -> None:
+def main(workspaces: tuple[Path, ...], only_bounds: bool) -> None:
     """Prints some lines for each workspace."""
     backend, device = resolve("auto", "cpu")
     ctx = StageContext(backend=backend, device=device)
+    if only_bounds:
+        print_bounds(workspaces, ctx)
+        return
     for root in workspaces:
         (config, scene, splats), draw = open_trained(root), np.random.default_rng(0)
         views, held = load_views(scene.train, config, ctx), load_reference_psnr(

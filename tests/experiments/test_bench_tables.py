@@ -1,4 +1,4 @@
-"""Tables, ratios, the page and the picture of `recon bench`: pure functions of known inputs."""
+"""Tables and ratios of `recon bench`: pure functions of known inputs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconError
 from recon_cli.evaluation.scores import Table, number, percent
-from recon_cli.experiments import outputs, rasterizer_benchmark
+from recon_cli.experiments import outputs
 from recon_cli.experiments.bench_measure import (
     FIGURES,
     SCHEMA,
@@ -18,17 +18,10 @@ from recon_cli.experiments.bench_measure import (
     BenchedScene,
     BenchResult,
     Speed,
-    VariantResult,
 )
 from recon_cli.experiments.bench_scene import Accuracy
-from recon_cli.experiments.instruments import (
-    Host,
-    Timing,
-    alternate,
-    peak_fraction,
-    rate,
-)
-from recon_cli.experiments.outputs import OutputFiles, Result
+from recon_cli.experiments.instruments import Host, Timing, alternate
+from recon_cli.experiments.outputs import OutputFiles
 from recon_cli.experiments.rasterizer_benchmark import (
     BenchRequest,
     check_comparable,
@@ -43,7 +36,6 @@ from recon_cli.experiments.rasterizer_benchmark import (
 from recon_cli.machine import cpu_model, install_command
 
 EXACT = Accuracy(1e-6, 1e-7, 0.0, 2e-6, "means", 1.0)
-ROUGH = Accuracy(0.1, 0.01, 0.5, 0.2, "quats", 0.9)
 
 
 def speed(threads: int, ms: float) -> Speed:
@@ -51,21 +43,17 @@ def speed(threads: int, ms: float) -> Speed:
     return Speed(threads, {
         "forward": Timing(ms, 0.1), "forward: composite": Timing(ms / 2, 0.0),
         "forward: rest": Timing(ms / 2, 0.0), "backward": Timing(2 * ms, 0.2),
-        "step": Timing(4 * ms, 0.4)}, 2.0, 1.0, 0.25, None)
+        "step": Timing(4 * ms, 0.4)})
 
 
 def backend(ms: float) -> BackendResult:
-    return BackendResult(speed(2, ms), speed(1, 1.5 * ms), EXACT, (4_000_000, 3_000_000), 10**7)
+    return BackendResult(speed(2, ms), speed(1, 1.5 * ms), EXACT, 10**7)
 
 
 def result(numba_ms: float = 10.0, torch_ms: float = 80.0) -> BenchResult:
-    host = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
-    variants = [
-        VariantResult("contract", Timing(30.0, 0.0), EXACT),
-        VariantResult("rough", Timing(20.0, 0.0), ROUGH)]
+    host = Host("A CPU", 2, 2, 16, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
     scene = BenchedScene(
-        1000, 64, 48, 3, {"numba": backend(numba_ms), "torch": backend(torch_ms)}, "numba",
-        variants)
+        1000, 64, 48, 3, {"numba": backend(numba_ms), "torch": backend(torch_ms)})
     return BenchResult(host, 7, {"room": scene})
 
 
@@ -96,16 +84,6 @@ def test_candidates_take_turns_and_the_first_round_is_not_counted() -> None:
     assert len(rounds) == 3
 
 
-def test_rates_and_fractions_of_the_peak() -> None:
-    assert rate(4_000_000, 2.0) == 2.0
-    assert rate(None, 2.0) is None
-    assert rate(4, None) is None
-    assert peak_fraction(2.0, 25, 100.0, 1) == 0.5
-    assert peak_fraction(2.0, 25, 100.0, 2) == 0.25
-    assert peak_fraction(None, 25, 100.0, 1) is None
-    assert peak_fraction(2.0, 25, None, 1) is None
-
-
 # ---- tables ----
 
 def test_numbers_keep_their_digits() -> None:
@@ -128,20 +106,14 @@ def test_the_figures_are_ratios_of_what_was_measured() -> None:
     assert rows["torch : this, forward + backward"] == ("8.00x", "1.00x")
     assert rows["the same with 1 thread"] == ("8.00x", "1.00x")
     assert rows["1 thread : 2 threads, whole step"] == ("1.50x", "1.50x")
-    assert rows["Gpairs/s a core, forward"] == ("2", "2")
-    assert rows["of the core's peak, forward"] == ("25%", "25%")
-    assert rows["of the core's peak, backward"] == ("-", "-")
     assert "interquartile range" in head(found)
     assert "A CPU, 2 of 2 cores" in head(found)
 
 
-def test_every_stage_error_and_approximation_has_a_row() -> None:
-    _, stages, errors, variants = tables(result())
-    assert ("numba forward: composite", "7.5 (0)", "5 (0)", "2", "25%") in stages.rows
+def test_every_stage_and_error_has_a_row() -> None:
+    _, stages, errors = tables(result())
+    assert ("numba forward: composite", "7.5 (0)", "5 (0)") in stages.rows
     assert [row[0] for row in errors.rows] == ["numba", "torch"]
-    assert [row[:3] for row in variants.rows] == [
-        ("contract", "30 (0)", "0"), ("rough", "20 (0)", "10")]
-    assert variants.rows[1][3:] == ("0.1", "0.01", "50%", "0.2", "quats", "0.1")
 
 
 # ---- the JSON file ----
@@ -180,7 +152,6 @@ def test_a_comparison_is_old_over_new_figure_by_figure() -> None:
     rows = {row[0]: row[1:] for row in comparison_table(old, new).rows}
     assert rows["room numba forward_ms"] == ("20", "10", "2")
     assert rows["room torch step_ms"] == ("320", "320", "1")
-    assert rows["room numba peak_fraction_backward"] == ("-", "-", "-")
     assert len(rows) == 2 * len(FIGURES)
     assert [ratio(*pair) for pair in ((4.0, 2.0), (None, 2.0), (4.0, None), (4.0, 0.0))] == [
         2.0, None, None, None]
@@ -218,62 +189,6 @@ def test_the_model_of_the_cpu_is_read_from_cpuinfo(tmp_path: Path) -> None:
     path.write_text("processor\t: 0\nmodel name\t: A: CPU\nmodel name\t: B\n")
     assert cpu_model(path) == "A: CPU"
     assert cpu_model(tmp_path / "none")
-
-
-# ---- the page ----
-
-PAGE = f"# Title\n\nby hand\n{outputs.BEGIN}\nold\n{outputs.END}\nby hand too\n"
-
-
-def write(path: Path, text: str) -> None:
-    path.write_text(outputs.replace_between_marks(path.read_text(), text))
-
-
-def test_only_what_stands_between_the_marks_is_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "page.md"
-    path.write_text(PAGE)
-    write(path, "\nnew\ntext\n")
-    assert path.read_text() == PAGE.replace("old", "\nnew\ntext\n")
-    write(path, "old")
-    assert path.read_text() == PAGE.replace("old", "\nold\n")
-
-
-@pytest.mark.parametrize("text", [
-    "", outputs.BEGIN, f"{outputs.END}\n{outputs.BEGIN}\n", PAGE + PAGE])
-def test_a_page_without_its_marks_is_refused_and_left_alone(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "page.md"
-    path.write_text(text)
-    with pytest.raises(FormatError, match="recon bench: begin"):
-        OutputFiles(markdown=path).write(Result({}, "head", []))
-    assert path.read_text() == text
-
-
-def test_a_page_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="cannot be read"):
-        OutputFiles(markdown=tmp_path / "none.md").check()
-
-
-# ---- the picture ----
-
-def test_the_front_holds_what_nothing_else_beats() -> None:
-    points = [(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (2.0, 2.0), (4.0, 1.0)]
-    assert rasterizer_benchmark.pareto_front(points) == [1, 3, 0]
-    assert rasterizer_benchmark.pareto_front([]) == []
-
-
-def test_the_points_are_backends_and_timed_approximations() -> None:
-    points = rasterizer_benchmark.list_points(next(iter(result().scenes.values())))
-    assert [(p.name, p.ms, p.image_error) for p in points] == [
-        ("numba", 30.0, 1e-7), ("torch", 240.0, 1e-7), ("rough", 20.0, 0.01)]
-
-
-@pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_the_picture_is_drawn(suffix: str, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    path = tmp_path / f"front{suffix}"
-    rasterizer_benchmark.draw(result(), path)
-    assert path.stat().st_size > 5000
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_without_matplotlib_the_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -79,7 +79,9 @@ def test_an_incomplete_room_is_refused_before_anything_runs(
 def test_one_command_fills_the_tables_and_a_second_runs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make_replica(tmp_path / "replica" / "office1", frames=16, tests=0)
+    make_replica(tmp_path / "disk" / "scan", frames=16, tests=0)
+    (tmp_path / "replica").mkdir()
+    (tmp_path / "replica" / "office1").symlink_to(tmp_path / "disk" / "scan")  # of another name
     make_replica(tmp_path / "home", frames=16, tests=0)
     words = ["study", "--replica", str(tmp_path / "replica"), str(tmp_path / "home"),
              "--out", str(tmp_path / "out"), "--iterations", "12", "--max-size", "32",

@@ -158,12 +158,20 @@ def test_a_study_that_was_killed_gives_the_same_figures(scene, made, tmp_path, s
 
 
 @pytest.mark.integration
-def test_what_is_kept_is_announced(scene, made, tmp_path):
-    before = work(tmp_path / "out", seeds=1).announcement([scene])
-    assert before.startswith("about 8 runs are to be made, 0 are kept from before; about")
+def test_the_time_is_estimated_before_the_second_scene_is_loaded(scene, made, tmp_path, caplog):
+    def loading():
+        assert "at most 16 runs of about 20 steps" in caplog.text
+        yield scene
+        assert "minutes for all, by short runs on" in caplog.text
+        yield scene
+
+    assert work(tmp_path / "out", seeds=1).load(loading(), 2) == [scene, scene]
+    assert "about 16 runs are to be made, 0 are kept from before" in caplog.text
     work(tmp_path / "out", seeds=1).run_scene(scene)
-    after = work(tmp_path / "out", seeds=1).announcement([scene])
-    assert after == "all 8 runs are kept from before"
+    caplog.clear()
+    work(tmp_path / "out", seeds=1).load([scene], 1)
+    assert "all 8 runs are kept from before" in caplog.text
+    assert "minutes" not in caplog.text
     assert made
 
 

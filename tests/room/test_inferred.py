@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiny_stages import CONTEXT
 
-from recon_cli.io.mesh_data import Mesh
+from recon_cli.io.mesh_data import Mesh, joined
 from recon_cli.room.depth_maps import weigh
 from recon_cli.room.inferred import _is_surrounded, infer_surface
 from recon_cli.room.mesh import mesh_of
@@ -198,3 +198,15 @@ def test_a_mesh_closes_holes_only_if_it_is_asked_to():
     again = mesh_of(
         maps_of(blank), None, CONTEXT, max_triangles=10**5, voxel=VOXEL, infer=True)
     assert np.array_equal(again.mesh.vertices, result.mesh.vertices)
+
+
+@pytest.mark.parametrize("most", [20, 200])
+def test_what_is_inferred_counts_among_the_triangles_that_are_allowed(most):
+    whole, result = (mesh_of(
+        in_hole(2.0, 0.0, 0.0, 0.0, 0.0, 0.0), None, CONTEXT, max_triangles=count, voxel=VOXEL,
+        infer=True) for count in (10**5, most))
+    assert len(whole.mesh.faces) > most < len(whole.inferred.faces)
+    assert 0 < len(result.mesh.faces) + len(result.inferred.faces) <= most
+    assert result.inferred.inferred.all()
+    assert joined(result.mesh, result.inferred).area() == pytest.approx(
+        joined(whole.mesh, whole.inferred).area(), rel=0.1)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from test_similarity import random_rotation
 
-from recon_cli.scene.harmonics import basis_rest, generators, rotate_sh, rotation_blocks
+from recon_cli.scene.harmonics import basis_rest, rotate_sh, rotation_blocks
 
 EXACT = 1e-12
 DEGREES = {1: slice(0, 3), 2: slice(3, 8), 3: slice(8, 15)}
@@ -95,39 +94,3 @@ def test_the_dtype_is_kept_and_float32_is_rounded_once():
     turned = rotate_sh(sh, rotation)
     assert turned.dtype == torch.float32
     assert torch.equal(turned, rotate_sh(sh.double(), rotation).float())
-
-
-def test_a_generator_is_the_start_of_a_turn():
-    reach, about = 1e-5, np.array([0.6, -0.3, 0.8])
-    sh = torch.randn(4, 15, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    ahead, behind = (rotate_sh(sh, Rotation.from_rotvec(sign * reach * about).as_matrix())
-                     for sign in (1, -1))
-    change = torch.einsum("i,ikm,nmc->nkc", torch.from_numpy(about), generators(), sh)
-    # central differences: the third order leaves reach^2 times a number of the order of 10
-    assert torch.allclose(change, (ahead - behind) / (2 * reach), rtol=0, atol=1e-8)
-
-
-def test_generators_are_antisymmetric_and_keep_degrees_apart():
-    held = generators()
-    assert torch.equal(held, -held.transpose(1, 2))
-    for degree, rows in DEGREES.items():
-        others = [i for i in range(15) if i not in range(15)[rows]]
-        assert not held[:, rows][:, :, others].any(), degree
-    assert int((held != 0).sum()) == 48
-
-
-def test_generators_are_exact_and_the_same_for_any_number_of_threads():
-    threads = torch.get_num_threads()
-    found = []
-    try:
-        for count in (1, 2, 5):
-            torch.set_num_threads(count)
-            generators.cache_clear()
-            found.append(generators())
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(found[0], other) for other in found)
-    turn = np.array([0.3, -0.5, 0.7])
-    expected = torch.block_diag(*rotation_blocks(Rotation.from_rotvec(turn).as_matrix()))
-    small = torch.einsum("i,ikm->km", torch.from_numpy(turn), generators())
-    assert torch.allclose(torch.matrix_exp(small), expected, rtol=0, atol=EXACT)

@@ -15,7 +15,6 @@ from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, ReconstructionError, StageError
 from recon_cli.io.colmap import read_images
-from recon_cli.scene.backdrop import SPHERE_GAUSSIANS
 from recon_cli.splats.format import SplatFormat
 from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
 from recon_cli.splats.registry import FORMATS, read_splats
@@ -38,15 +37,15 @@ def exported(tiny_learnt, tmp_path_factory):
     return out, export.run(ExportConfig(format=",".join(ASKED)), tiny_learnt, out, CONTEXT)
 
 
-def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported):
+def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported, inputs):
     out, summary = exported
     assert set(summary.files) == set(ASKED) - {"ply"}
     ply = out / "splats.ply"
     for name in FORMATS.keys() - {"ply"}:
         told = summary.files[name]
         path = out / told.file
-        # formats that cannot say so hold the backdrop as Gaussians
-        assert len(read_splats(path)) == len(read_ply(ply)) + SPHERE_GAUSSIANS
+        trained = read_ply(inputs.folders["train"] / "splats.ply").with_sphere()
+        assert len(read_splats(path)) == len(trained if name == "html" else read_ply(ply))
         files = path.parent.rglob("*.*") if name == "lod" else [path]
         size = sum(file.stat().st_size for file in files)
         assert told.bytes == size
@@ -133,7 +132,8 @@ def test_a_format_that_loses_more_than_it_may_is_refused(inputs, tmp_path, monke
 
 
 def test_a_scene_that_is_measured_is_scored_in_its_new_world(inputs, tmp_path):
-    config = ExportConfig(format="glb", scale_between=("000000.png", "000006.png", 7.0))
+    config = ExportConfig(
+        format="glb", scale_between=("000000.png", "000006.png", 7.0), backdrop="keep")
     summary = export.run(config, inputs, tmp_path, CONTEXT)
     assert abs(summary.files["glb"].psnr_change_db) < 1e-3
     before = read_ply(inputs.folders["train"] / "splats.ply")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 from tiny_stages import CONTEXT, LEARNT
 
+from recon_cli.cli import main
 from recon_cli.config.export import ExportConfig
 from recon_cli.errors import ConfigError
 from recon_cli.export.reduce import fit_to_size
@@ -15,7 +18,7 @@ from recon_cli.export.verify import load_reference_psnr
 from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0
-from recon_cli.splats.ply import read_ply
+from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.splats.registry import FORMATS
 from recon_cli.stages import export
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
@@ -45,24 +48,62 @@ def test_a_crop_keeps_the_centres_in_the_box_and_says_what_went(inputs, whole, t
     kept = whole.means[whole.means[:, 0] <= middle[0]]
     assert torch.equal(read_ply(tmp_path / "splats.ply").means, kept)
     (change,) = summary.changes
-    assert (change.gaussians, change.gaussians_before) == (len(kept), len(whole))
+    file = len(whole.with_sphere())
+    assert (change.gaussians, change.gaussians_before) == (len(kept), file)
     assert change.psnr_change_db < -0.5  # half of the scene is gone
-    assert any(line.startswith(f"crop: {len(kept)} of {len(whole)}") for line in caplog.messages)
+    assert any(line.startswith(f"crop: {len(kept)} of {file:,}") for line in caplog.messages)
 
 
 def test_without_its_backdrop_a_scene_is_on_black_and_the_loss_is_said(inputs, whole, tmp_path):
     assert whole.backdrop is not None
-    summary = exported(inputs, tmp_path, drop_backdrop=True, format="spz")
+    summary = exported(inputs, tmp_path, backdrop="drop", format="spz")
     back = read_ply(tmp_path / "splats.ply")
     assert back.backdrop is None
     assert torch.equal(back.means, whole.means)
     assert len(FORMATS["spz"].read(tmp_path / "splats.spz")) == len(whole)
     (change,) = summary.changes
-    assert (change.option, change.gaussians) == ("drop_backdrop", len(whole))
+    assert (change.option, change.gaussians) == ("backdrop", len(whole))
     scene = load_scene(inputs.folders, validation=LEARNT.validation)
     psnr = load_reference_psnr(scene, Similarity(), LEARNT.max_size, CONTEXT)
     assert change.psnr_change_db == pytest.approx(
         psnr.psnr_db(back) - psnr.psnr_db(whole), abs=1e-3)
+
+
+def test_files_are_bounded_but_the_page_and_what_is_kept(inputs, whole, tmp_path):
+    far = replace(whole, means=whole.means.clone())
+    row = int(far.means.norm(dim=1).argmax())
+    far.means[row] *= 1000 / far.means[row].norm()
+    folder = tmp_path / "train"
+    shutil.copytree(inputs.folders["train"], folder)
+    write_ply(folder / "splats.ply", far)
+    inputs = replace(inputs, folders={**inputs.folders, "train": folder})
+    for name in ("bounded", "kept"):
+        (tmp_path / name).mkdir()
+    summary = exported(inputs, tmp_path / "bounded", format="glb,html")
+    files = {name: FORMATS[name].read(tmp_path / "bounded" / f"splats.{name}")
+             for name in ("ply", "glb", "html")}
+    for name in ("ply", "glb"):
+        assert files[name].means.abs().max() < 100
+        assert len(files[name]) == summary.gaussians
+    assert files["html"].means.abs().max() > 900
+    assert [change.option for change in summary.changes] == ["backdrop"]
+    assert summary.changes[0].gaussians == summary.gaussians
+    kept = exported(inputs, tmp_path / "kept", backdrop="keep")
+    assert torch.equal(read_ply(tmp_path / "kept" / "splats.ply").means, far.means)
+    assert kept.gaussians == len(far.with_sphere())
+    assert kept.changes is None
+
+
+def test_the_old_spelling_of_the_backdrop_works_or_says_what_to_write(tmp_path, capsys):
+    assert main(["export", "--drop-backdrop", "--print-config", "-w", str(tmp_path)]) == 0
+    assert 'backdrop = "drop"' in capsys.readouterr().out
+    config = tmp_path / "old.toml"
+    config.write_text("[export]\ndrop_backdrop = false\n")
+    assert main(["export", "--config", str(config), "--print-config", "-w", str(tmp_path)]) == 0
+    capsys.readouterr()
+    config.write_text("[export]\ndrop_backdrop = true\n")
+    assert main(["export", "--config", str(config), "-w", str(tmp_path)]) == 2
+    assert "export.backdrop" in capsys.readouterr().err
 
 
 def test_a_crop_is_in_units_of_the_exported_scene(inputs, whole, tmp_path):
@@ -83,7 +124,7 @@ def test_a_box_without_gaussians_is_refused_with_where_they_are(inputs, tmp_path
 
 
 def test_a_lower_degree_keeps_the_colours_that_the_views_see(inputs, whole, tmp_path):
-    summary = exported(inputs, tmp_path, sh_degree=1)
+    summary = exported(inputs, tmp_path, sh_degree=1, backdrop="keep")
     back = read_ply(tmp_path / "splats.ply")
     assert back.sh_degree == 1
     (change,) = summary.changes
@@ -95,7 +136,7 @@ def test_a_lower_degree_keeps_the_colours_that_the_views_see(inputs, whole, tmp_
 
 
 def test_a_file_without_harmonics_has_the_colours_that_the_views_see(inputs, whole, tmp_path):
-    exported(inputs, tmp_path, format="splat", drop_backdrop=True)
+    exported(inputs, tmp_path, format="splat", backdrop="drop")
     exported(inputs, tmp_path, format="ply", sh_degree=0)
     back = FORMATS["splat"].read(tmp_path / "splats.splat")
     fitted = read_ply(tmp_path / "splats.ply")
@@ -106,7 +147,7 @@ def test_a_file_without_harmonics_has_the_colours_that_the_views_see(inputs, who
 
 
 def test_a_palette_that_loses_too_much_gets_more_entries(inputs, tmp_path):
-    alone = {"format": "sog", "drop_backdrop": True}
+    alone = {"format": "sog", "backdrop": "drop"}
     small = exported(inputs, tmp_path, **alone, max_loss=9.0).files["sog"]
     allowed = -0.7 * small.psnr_change_db
     large = exported(inputs, tmp_path, **alone, max_loss=allowed).files["sog"]
@@ -116,10 +157,10 @@ def test_a_palette_that_loses_too_much_gets_more_entries(inputs, tmp_path):
 
 @pytest.mark.parametrize("name", ["ply", "spz", "sog"])
 def test_a_file_is_no_larger_than_asked_for(inputs, whole, tmp_path, name):
-    exported(inputs, tmp_path, format=name, drop_backdrop=True)
+    exported(inputs, tmp_path, format=name, backdrop="drop")
     path = tmp_path / EXPORT_FORMATS[name].file
     most = 0.6 * path.stat().st_size / 1e6
-    summary = exported(inputs, tmp_path, format=name, max_mb=most, drop_backdrop=True)
+    summary = exported(inputs, tmp_path, format=name, max_mb=most, backdrop="drop")
     assert path.stat().st_size <= 1e6 * most
     _, change = summary.changes
     assert change.gaussians < len(whole) or change.degree < 3

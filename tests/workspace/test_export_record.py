@@ -81,7 +81,7 @@ def test_the_record_survives_its_file():
     ({"model": "base"}, {"model": "pruned"}, "it shows the base model"),
     ({"crop": None}, {"crop": [0.5, 1.0]}, "it was written before --crop 0.5 1"),
     ({"crop": [0.5, 1.0]}, {"crop": None}, "it was written with --crop 0.5 1"),
-    ({"drop_backdrop": False}, {"drop_backdrop": True}, "it was written before --drop-backdrop"),
+    ({"backdrop": "bounded"}, {"backdrop": "drop"}, "it was written with --backdrop bounded"),
     ({"up": "y"}, {"up": "-y"}, "it was written with --up y"),
     ({"transform": [1.0] * 16}, {"transform": None}, "it was written with --transform"),
     ({"limited": None}, {"limited": "spz"}, "--max-mb limited nothing"),

@@ -18,10 +18,10 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from recon_cli.render.contract import (
-    EXACT, Approximation, RenderOutput, Statistics, StepOptions, TargetImage)
+    RenderOutput, Statistics, StepOptions, TargetImage)
 from recon_cli.kernels.kernel import CODE, cache_folder, unsaved
 from recon_cli.render.numba.optimizer import step
-from recon_cli.render.numba.step import PhotometricStep, camera_gradient
+from recon_cli.render.numba.step import PhotometricStep
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.render.numba.view_pass import (
     ImageBuffers, Lease, PackedSplats, RenderSettings, flat)
@@ -36,9 +36,9 @@ _READY = "ready"  # file in the cache folder once every kernel is there
 
 def render(
     splats: Splats, camera: Camera, background: Tensor, sh_degree: int, scores: bool,
-    mask: Tensor | None = None, approximation: Approximation = EXACT,
+    mask: Tensor | None = None,
 ) -> RenderOutput:
-    """Renders by the contract, or by a cheaper one; see `recon_cli.render.registry.render`.
+    """Renders by the contract; see `recon_cli.render.registry.render`.
 
     Raises ValueError unless the splats are float32 on the CPU.
     """
@@ -49,7 +49,7 @@ def render(
         tensors[5] = tensors[5].detach()  # not used by the image
     settings = RenderSettings(
         flat(background).copy(), sh_degree, scores,
-        None if mask is None else mask.contiguous().numpy(), approximation)
+        None if mask is None else mask.contiguous().numpy())
     rgb, alpha, depth = _Render.apply(background, camera, settings, statistics, *tensors)
     return RenderOutput(rgb, alpha, depth, statistics)
 
@@ -61,8 +61,7 @@ def find_crossing(splats: Splats, camera: Camera, level: float) -> Tensor:
     rows = torch.empty(camera.height, camera.width, dtype=torch.int32)
     lease.view_pass.crossing(
         PackedSplats.from_tensors(splats.parameters().values()), camera,
-        RenderSettings(np.zeros(3, np.float32), 0), level, rows.view(-1).numpy(),
-        Statistics.zeros(splats.means.detach()))
+        level, rows.view(-1).numpy(), Statistics.zeros(splats.means.detach()))
     return rows.long()
 
 
@@ -202,7 +201,6 @@ def _run_all() -> None:
     gradients = splats.map(torch.zeros_like)
     photograph = TargetImage(np.zeros((20, 20, 3), np.uint8))
     PhotometricStep()(splats, gradients, camera, photograph, StepOptions(3, 0.2))
-    camera_gradient(splats, gradients, camera, 3)
     render(splats, camera, torch.zeros(3), 3, scores=True)
     find_crossing(splats, camera, 0.5)
     groups = [tensor.reshape(-1) for tensor in gradients.parameters().values()]

@@ -14,7 +14,7 @@ import numpy as np
 from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd_functions import fetch_add
 from recon_cli.render.numba.soa import (
-    BLOCK, EXTENT_X, EXTENT_Y, FAR, MEAN_X, MEAN_Y, RECORD, SLOPE_Y, TILE_HEIGHT, TILE_WIDTH, U_X,
+    BLOCK, EXTENT_X, EXTENT_Y, MEAN_X, MEAN_Y, RECORD, SLOPE_Y, TILE_HEIGHT, TILE_WIDTH, U_X,
     U_Y, V_Y)
 
 _MARGIN = np.float32(1e-3)  # pixels
@@ -72,14 +72,12 @@ def order_by_depth(keys, rows, order, spare):
 
 
 @kernel
-def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles, keys, order, spare,
-               visible):
+def find_spans(counter, records, rows, starts, tiles_x, spans, tiles, keys, order, spare, visible):
     """Writes for each row of tiles of each Gaussian the first tile and the end, and sorts by depth.
 
     `rows` [M * 2] are first row and number of rows, `starts` [M + 1] where the spans of each begin.
-    With `square` the whole box counts, not the ellipse in it. Written are `spans` [S * 2] and
-    `tiles` [M], the number of tiles of each Gaussian. Meanwhile one thread sorts: see
-    `order_by_depth`, whose result is `visible` [1].
+    Written are `spans` [S * 2] and `tiles` [M], the number of tiles of each Gaussian. Meanwhile one
+    thread sorts: see `order_by_depth`, whose result is `visible` [1].
     """
     n = len(tiles)
     blocks = (n + BLOCK - 1) // BLOCK
@@ -97,8 +95,6 @@ def find_spans(counter, records, rows, starts, tiles_x, square, spans, tiles, ke
             extent_x, extent_y = records[at + EXTENT_X], records[at + EXTENT_Y]
             per_u = _ONE / records[at + U_X]
             slope, half = -records[at + U_Y] * per_u, extent_y * records[at + V_Y] * per_u
-            if square:
-                slope, half = _ZERO, np.float32(FAR)
             per_extent = _ONE / extent_y
             rightmost = records[at + SLOPE_Y] * extent_x  # y offset of the rightmost point
             for k in range(rows[2 * j + 1]):

@@ -22,7 +22,7 @@ from recon_cli.render.numba.compositing import (
 from recon_cli.kernels.kernel import kernel
 from recon_cli.kernels.simd import LANES
 from recon_cli.kernels.simd_functions import (
-    bits, broadcast, count_bits, exp2, fetch_add, fill, fma, largest, load, lowest_bit,
+    bits, broadcast, exp2, fetch_add, fill, fma, largest, load, lowest_bit,
     minimum, select, store, totals)
 from recon_cli.render.numba.soa import (
     BATCH, BLUE, DEPTH, GREEN, LOG2_ALPHA_MAX, PATCHES, RED, SLOT, TILE_HEIGHT, TILE_PIXELS,
@@ -40,7 +40,7 @@ BACKWARD_FLOATS = _BATCH + BATCH_FLOATS
 @kernel
 def composite_backward(counter, tile_start, members, slots, records, width, height, tiles_x,
                        cutoff, background, final, last, met, grad_rgb, grad_alpha, grad_depth,
-                       details, scores, counting, sums, evaluated, scratch):
+                       details, scores, counting, sums, scratch):
     """Sums the gradients of every instance over the pixels of its tile.
 
     The arguments are those of `compositing.composite`, and `grad_*`, dL/d(rgb, alpha, depth), the
@@ -56,7 +56,6 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
         column, row = patch_pixels(patch)
         store(scratch, _COLUMN + patch * LANES, column)
         store(scratch, _ROW + patch * LANES, row)
-    pairs = 0
     while True:
         tile = fetch_add(counter, 0, 1)
         if tile >= tiles:
@@ -111,7 +110,6 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                 for patch in range(0, PATCHES, LANES):
                     needed |= bits(load(scratch, _LIMITS + patch) >= number) << np.uint64(patch)
                 needed &= np.uint64(met[first + k])
-                pairs += count_bits(needed) * LANES
                 g_red, g_green, g_blue, g_depth = zero, zero, zero, zero
                 s_0, s_u, s_v, s_uu, s_uv, s_vv = zero, zero, zero, zero, zero, zero
                 squared, hits, loo = zero, zero, zero
@@ -172,4 +170,3 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                     store(sums, to + 8, totals((
                         s_uv, s_vv, squared, hits, loo, zero, zero, zero)))
             end = first
-    fetch_add(evaluated, 0, pairs)

@@ -16,7 +16,7 @@ import numpy as np
 from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd import LANES
 from recon_cli.kernels.simd_functions import (
-    bits, broadcast, count_bits, exp2, fetch_add, fill, floor, fma, lane_numbers, largest, load,
+    bits, broadcast, exp2, fetch_add, fill, floor, fma, lane_numbers, largest, load,
     lowest_bit, maximum, minimum, select, square_root, store, total)
 from recon_cli.render.numba.soa import (
     BATCH, BLUE, DEPTH, EXTENT_X, EXTENT_Y, FAR, GREEN, HALF_Y, LOG2_ALPHA_MAX, LOG2_OPACITY,
@@ -95,7 +95,7 @@ def find_patches(batch, patches, k, count):
     extent_x, extent_y = load(batch, _EXTENT_X + k), load(batch, _EXTENT_Y + k)
     per_u = 1.0 / load(batch, _U_X + k)
     slope, half = -load(batch, _U_Y + k) * per_u, extent_y * load(batch, _V_Y + k) * per_u
-    square = load(batch, _HALF_Y + k) >= FAR  # a box without an ellipse
+    square = load(batch, _HALF_Y + k) >= FAR  # so large that only its box cuts
     slope, half = select(square, 0.0, slope), select(square, fill(FAR), half)
     rightmost = load(batch, _SLOPE_Y + k) * extent_x  # y offset of the rightmost point
     per_extent = 1.0 / extent_y
@@ -173,7 +173,7 @@ def pixel(column, row):
 @kernel
 def composite(counter, tile_start, members, records, width, height, tiles_x, cutoff, t_min,
               background, rgb, alpha, depth, final, last, met, scores, counting, slots, hits,
-              weights, peaks, evaluated, scratch):
+              weights, peaks, scratch):
     """Composites tile by tile.
 
     Args:
@@ -193,13 +193,11 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
         slots: [E] slot of each instance.
         hits: [E] out by slot, zeros before; so are weights, the sum, and peaks, the maximum of
             alpha T.
-        evaluated: [1] pairs of an instance and a pixel are added.
     """
     tiles = len(tile_start) - 1
     has_depth = len(depth) > 0
     batch = scratch[_BATCH:]
     patches = np.zeros(PATCHES, np.uint64)
-    pairs = 0
     while True:
         tile = fetch_add(counter, 0, 1)
         if tile >= tiles:
@@ -237,7 +235,6 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                 if meets == 0:
                     continue
                 column, row = patch_pixels(patch)
-                pairs += count_bits(meets) * LANES
                 at = patch * LANES
                 T, final_T = load(scratch, _T + at), load(scratch, _FINAL + at)
                 latest, z = load(scratch, _LAST + at), load(scratch, _DEPTH + at)
@@ -300,7 +297,6 @@ def composite(counter, tile_start, members, records, width, height, tiles_x, cut
                 alpha[p] = _ONE - t
                 if has_depth:
                     depth[p] = scratch[_DEPTH + at]
-    fetch_add(evaluated, 0, pairs)
 
 
 @kernel

@@ -19,7 +19,7 @@ from recon_cli.kernels.simd_functions import (
     absolute, bits, count_bits, exp2, fetch_add, fill, lane_numbers, load, log2, lowest_bit,
     maximum, minimum, square_root, store, transpose)
 from recon_cli.render.numba.soa import (
-    BLOCK, BLUE, DEPTH, EXTENT_X, EXTENT_Y, FAR, GREEN, HALF_Y, LOG2_E, LOG2_OPACITY, MEAN_X,
+    BLOCK, BLUE, DEPTH, EXTENT_X, EXTENT_Y, GREEN, HALF_Y, LOG2_E, LOG2_OPACITY, MEAN_X,
     MEAN_X_LOW, MEAN_Y, MEAN_Y_LOW, OUT, P_BASIS, P_DC, P_DX, P_DY, P_DZ, P_LOGIT, P_MEAN_X,
     P_MEAN_X_LOW, P_MEAN_Y, P_MEAN_Y_LOW, P_QW, P_QX, P_QY, P_QZ, P_REST, P_S0, P_S1, P_S2, P_Z,
     RECORD, RED, SLOPE_Y, SQUARE, TILE_HEIGHT, U_X, U_Y, V_Y, gather, image_axes, terms_of_group,
@@ -111,7 +111,7 @@ def compact(candidates, counts, ids):
 
 @kernel
 def project(counter, ids, means, quats, log_scales, logits, sh_dc, sh_rest, stride, terms, view,
-            alpha_min, square, records, depths, rows, radii, broken, scratch):
+            alpha_min, records, depths, rows, radii, broken, scratch):
     """Writes record, depth (float64), rows of tiles and radius of every Gaussian in `ids`."""
     n = len(ids)
     blocks = (n + BLOCK - 1) // BLOCK
@@ -126,7 +126,7 @@ def project(counter, ids, means, quats, log_scales, logits, sh_dc, sh_rest, stri
             used = terms_of_group(ids, first, sh_rest, stride, terms)
             gather(scratch, ids, first, count, means, quats, log_scales, logits, sh_dc, sh_rest,
                    stride, used, view, depths)
-            sound = shape(scratch, view, _F(alpha_min), square)
+            sound = shape(scratch, view, _F(alpha_min))
             sound &= (bits(colour(scratch, used)))
             for plane in range(0, RECORD, LANES):
                 transpose(scratch, (OUT + plane) * LANES, scratch, SQUARE * LANES)
@@ -193,7 +193,7 @@ def factor(scratch, view):
 
 
 @inlined
-def shape(scratch, view, alpha_min, square):
+def shape(scratch, view, alpha_min):
     """Writes the ellipse of each lane; returns the bits of those that are sound."""
     v00, v01, v02, v10, v11, v12 = factor(scratch, view)
     a0, b = v00 * v00 + v01 * v01 + v02 * v02, v00 * v10 + v01 * v11 + v02 * v12
@@ -216,8 +216,6 @@ def shape(scratch, view, alpha_min, square):
     slope_y, half_y = b * per_a, square_root(reach * det * per_a)
     mid, half = 0.5 * (a + c), 0.5 * (a - c)
     radius = 3.0 * square_root(mid + square_root(half * half + b * b))  # along the longer axis
-    if square:
-        extent_x, extent_y, slope_y, half_y = radius, radius, 0.0 * a, fill(FAR)
     at = OUT * LANES
     mean_x, mean_y = load(scratch, P_MEAN_X * LANES), load(scratch, P_MEAN_Y * LANES)
     store(scratch, at + MEAN_X * LANES, mean_x)

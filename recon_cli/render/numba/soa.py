@@ -38,7 +38,7 @@ SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
 # What float32 drops of the mean: at 640 pixels it is 3e-5, and decides who reaches alpha = 1/255.
 MEAN_X_LOW, MEAN_Y_LOW = 14, 15
 
-FAR = 1e9  # pixels; the half of an ellipse that only its box cuts
+FAR = 1e9  # pixels; half of an ellipse so large that only its box cuts
 BATCH = 64  # instances of a tile that are prepared at a time, a bit each
 
 # What the backward pass sums over the pixels of an instance, in its slot; s = alpha dL/dalpha.

@@ -15,7 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.render.contract import EXACT, Approximation, EllipseGradients, Statistics
+from recon_cli.render.contract import (
+    ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    EllipseGradients,
+    Statistics,
+)
 from recon_cli.render.numba import binning
 from recon_cli.render.numba.composite_backward import BACKWARD_FLOATS, composite_backward
 from recon_cli.render.numba.compositing import FORWARD_FLOATS, composite, tally
@@ -75,7 +80,6 @@ class RenderSettings:
     sh_degree: int  # in use; at most what the splats have is used
     scores: bool = False  # fill hits and blend weights of `Statistics` in the forward pass
     counting: NDArray[np.bool_] | None = None  # [H, W] pixels in the scores of both passes
-    approximation: Approximation = EXACT
 
 
 def flat(tensor: Tensor) -> NDArray[np.float32]:
@@ -89,8 +93,6 @@ class ViewPass:
 
     def __init__(self) -> None:
         self._buffers: dict[str, NDArray[Any]] = {}
-        self.pairs_forward = 0
-        self.pairs_backward = 0
 
     def take(self, name: str, size: int, dtype: Any = np.float32) -> NDArray[Any]:
         """Returns the buffer of a name with room for `size`, uninitialised."""
@@ -113,9 +115,9 @@ class ViewPass:
         stored = splats.stride // 3 if len(splats.sh_rest) else 0
         self.terms = min((settings.sh_degree + 1) ** 2 - 1, stored)
         self.background = settings.background
-        self.cutoff = np.float32(np.log2(settings.approximation.alpha_min))
-        self._project(splats, settings.approximation, statistics)
-        self._bin(settings.approximation.square)
+        self.cutoff = np.float32(np.log2(ALPHA_MIN))
+        self._project(splats, statistics)
+        self._bin()
         self._composite(settings, image)
         if settings.scores:
             totals = statistics.hits, statistics.blend_sum, statistics.blend_max
@@ -125,29 +127,27 @@ class ViewPass:
                   *(total.numpy() for total in totals))
 
     def crossing(
-        self, splats: PackedSplats, camera: Camera, settings: RenderSettings, level: float,
-        rows: NDArray[np.int32], statistics: Statistics,
+        self, splats: PackedSplats, camera: Camera, level: float, rows: NDArray[np.int32],
+        statistics: Statistics,
     ) -> None:
         """Writes into `rows` [H * W] which Gaussian brings T down to `level`, -1 where none does.
 
         No backward pass may follow.
         """
         self.view, self.terms = viewpoint(camera), 0
-        self.cutoff = np.float32(np.log2(settings.approximation.alpha_min))
-        self._project(splats, settings.approximation, statistics)
-        self._bin(settings.approximation.square)
+        self.cutoff = np.float32(np.log2(ALPHA_MIN))
+        self._project(splats, statistics)
+        self._bin()
         pool.run(find_crossing, self.tile_start, self.members, self.records, self.ids,
                  self.view.width, self.view.height, self.tiles_x, self.cutoff, np.float32(level),
                  rows)
 
-    def _project(
-        self, splats: PackedSplats, approximation: Approximation, statistics: Statistics
-    ) -> None:
+    def _project(self, splats: PackedSplats, statistics: Statistics) -> None:
         n = len(splats.logit_opacities)
         candidates = self.take("candidates", n, np.int32)
         counts, broken = np.empty(-(-n // BLOCK), np.int64), np.zeros(1, np.int64)
         pool.run(cull, splats.means, splats.log_scales, splats.logit_opacities, self.view,
-                 approximation.alpha_min, candidates, counts, broken)
+                 ALPHA_MIN, candidates, counts, broken)
         self.block_starts = np.concatenate([[0], np.cumsum(counts)])
         m = int(self.block_starts[-1])
         self.ids = self.take("ids", m, np.int32)
@@ -158,11 +158,11 @@ class ViewPass:
         statistics.radii.zero_()
         pool.run(project, self.ids, splats.means, splats.quats, splats.log_scales,
                  splats.logit_opacities, splats.sh_dc, splats.sh_rest, splats.stride, self.terms,
-                 self.view, approximation.alpha_min, approximation.square, self.records,
-                 self.depths, self.rows, flat(statistics.radii), broken)
+                 self.view, ALPHA_MIN, self.records, self.depths, self.rows,
+                 flat(statistics.radii), broken)
         statistics.broken = int(broken[0])
 
-    def _bin(self, square: bool) -> None:
+    def _bin(self) -> None:
         m = len(self.ids)
         self.tiles_x = -(-self.view.width // TILE_WIDTH)
         tiles = self.tiles_x * -(-self.view.height // TILE_HEIGHT)
@@ -172,7 +172,7 @@ class ViewPass:
         per_gaussian = self.take("tiles", m, np.int32)
         order, visible = self.take("order", m, np.int32), np.zeros(1, np.int64)
         pool.run(binning.find_spans, self.records, self.rows, span_starts, self.tiles_x,
-                 square, spans, per_gaussian, self.depths.view(np.uint64), order,
+                 spans, per_gaussian, self.depths.view(np.uint64), order,
                  self.take("spare", m, np.int32), visible, scratch=False)
         self.slot_start = self.take("slot_start", m + 1, np.int64)
         binning.slot_starts(per_gaussian, self.slot_start)
@@ -194,7 +194,6 @@ class ViewPass:
         self.final = self.take("final", tiles * TILE_PIXELS)
         self.last = self.take("last", tiles * TILE_PIXELS)
         self.met = self.take("met", len(self.members), np.uint32)
-        evaluated = np.zeros(1, np.int64)
         scored = len(self.members) if settings.scores else 0
         self.hits = self.take("hits", scored, np.int32)
         self.weights, self.peaks = self.take("weights", scored), self.take("peaks", scored)
@@ -206,10 +205,9 @@ class ViewPass:
         pool.run(
             composite, self.tile_start, self.members, self.records, self.view.width,
             self.view.height, self.tiles_x, self.cutoff,
-            np.float32(settings.approximation.transmittance_min), self.background, image.rgb,
+            np.float32(TRANSMITTANCE_MIN), self.background, image.rgb,
             image.alpha, image.depth, self.final, self.last, self.met, settings.scores,
-            self.counting, self.slots, self.hits, self.weights, self.peaks, evaluated)
-        self.pairs_forward = int(evaluated[0])
+            self.counting, self.slots, self.hits, self.weights, self.peaks)
 
     def backward(
         self, splats: PackedSplats, gradients: PackedSplats, image: ImageBuffers,
@@ -222,13 +220,11 @@ class ViewPass:
         pixels that counted in the forward pass.
         """
         sums = self.take("sums", len(self.members) * SLOT)
-        evaluated = np.zeros(1, np.int64)
         pool.run(
             composite_backward, self.tile_start, self.members, self.slots, self.records,
             self.view.width, self.view.height, self.tiles_x, self.cutoff, self.background,
             self.final, self.last, self.met, image.rgb, image.alpha, image.depth, details, loo,
-            self.counting, sums, evaluated)
-        self.pairs_backward = int(evaluated[0])
+            self.counting, sums)
         pool.run(
             project_backward, self.ids, self.block_starts, self.slot_start, sums, self.depths,
             splats.means, splats.quats, splats.log_scales, splats.logit_opacities, splats.sh_dc,
