@@ -42,7 +42,8 @@ SECTIONS: dict[str, type[StageConfig]] = {
 # Options that are gone, with the values that ask for what is done now: a file of an earlier
 # version, as `--print-config` wrote it, still means the same.
 GONE: dict[str, dict[str, tuple[Any, ...]]] = {
-    "train": {"poses": ("auto", "off"), "densify_scale": (0.01,)},
+    "train": {"poses": ("auto", "off"), "densify_scale": (0.01,), "tone": ("off",),
+              "blur": ("auto", "off"), "shutter": ()},
     "merge": {"validation": (0.05,)},
 }
 
@@ -151,12 +152,15 @@ def check_names(section: str, names: Iterable[str], *, where: str) -> None:
             hint=_suggest(section, list(SECTIONS), "Sections:"))
     known = [item.name for item in dataclasses.fields(SECTIONS[section])]
     for name in names:
+        if name in GONE.get(section, {}):
+            raise ConfigError(
+                f"{where} sets {section}.{name}, which recon no longer has.",
+                hint=f"Delete the line {name} = ... below [{section}] in a file, and leave out "
+                f"--set {section}.{name}.")
         if name not in known:
             raise ConfigError(
                 f"{where} sets {section}.{name}, which does not exist.",
-                hint="It is gone since an earlier version: leave it out."
-                if name in GONE.get(section, {}) else
-                _suggest(name, known, f"Options of [{section}]:"))
+                hint=_suggest(name, known, f"Options of [{section}]:"))
 
 
 def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> None:

@@ -25,15 +25,12 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
 from recon_cli.render.response import LensFalloffs
-from recon_cli.scene.motion import Motion
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.train.background import FarContent, faces, far_content, look_at_one_thing
 from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
-from recon_cli.train.motion_blur import blurred_psnr
-from recon_cli.train.moved import hide_rarer, was_moved
 from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_search import (
     Judge,
@@ -43,28 +40,19 @@ from recon_cli.train.moving_search import (
     first_look,
     hide,
     is_plausible,
-    join,
     search,
     share_of,
 )
-from recon_cli.train.photometric_evidence import PhotometricEvidence, find_photometry
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.shutter import BlurEvidence, ViewMotions
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 from recon_cli.train.trial_decisions import THRESHOLD_DB, decide, skip_trial, split
+from recon_cli.train.vignette_evidence import VignetteEvidence, find_vignettes
 from recon_cli.workspace.summaries import TrialDecision
 
-# Gain that blur needs: a room that gained 2.6 dB on sharp views gained 1.6 in its trial; two walks
-# gained 0 and .1, and their sharp views nothing.
-BLUR_DB = 0.5
 # Loss that speaks against depth, which was measured: with exact depth a wall lost -.04 to .13 dB by
 # the seed alone, and with depth that is wrong by a third -.06 to .19.
 DEPTH_DB = 0.2
-_BLUR_SIDE = 300  # pixels of the longer side in the trial of blur, which is gone at LEVEL
-# Times the shutter time of edges 2 pixels wide. 2.8 in a room that was blurred by a known time: its
-# edges are softer.
-SHUTTERS = 1.25, 2.5
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
 _STEPS = 400
@@ -73,12 +61,12 @@ _POINTS = 5000
 _CAP = 10_000
 _LEAST_SEARCHED = 1000  # steps of a run in which what moves is looked for
 logger = logging.getLogger("recon")
-PARTS = ("far", "stereo", "exposure", "vignette", "tone", "images", "depth", "blur")
+PARTS = ("far", "stereo", "exposure", "vignette", "images", "depth")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
     """Returns the parts of the model that trials decide on, by the names of their options."""
-    return {name: getattr(config, name) for name in (*PARTS, "shutter", "sh_degree")}
+    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
 
 
 @dataclass(frozen=True)
@@ -113,10 +101,8 @@ class TrialScene:
 def examine(scene: TrialScene) -> Needs:
     """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     config = scene.task.schedule.config
-    if config.densify == "reference":  # sees what tables of the literature saw
-        for part in ("vignette", "tone"):
-            if getattr(config, part) == "auto":
-                config = _with(config, part, "off")
+    if config.densify == "reference" and config.vignette == "auto":
+        config = replace(config, vignette="off")  # sees what tables of the literature saw
     if config.stereo == "auto":
         config = replace(config, stereo="on")
     bench = _Bench(scene)
@@ -147,20 +133,12 @@ def examine(scene: TrialScene) -> Needs:
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
-    light = bench.light(config)
-    settle("vignette", "on" if light.shades else None,
-           f"the corners of the views lack {100 * light.corner_loss:.1f}% of the light only")
-    settle("tone", "on" if light.bends_differ else None,
-           f"tone curves of the views differ by {100 * light.bend_spread:.1f}% only")
+    vignettes = bench.vignettes(config)
+    settle("vignette", "on" if vignettes.shades else None,
+           f"the corners of the views lack {100 * vignettes.corner_loss:.1f}% of the light only")
     if config.depth == "auto" and not (scene.task.has_depth or scene.task.depth_refused):
         config = replace(config, depth="off")
     settle("depth", "on" if scene.task.has_depth else None, scene.task.depth_refused)
-    if config.blur != "off":
-        blur = bench.blur
-        if config.shutter is None:
-            config = replace(config, shutter=bench.shutter(config))
-        settle("blur", "on" if blur.speaks else None,
-               "the motion of the camera does not tell which views are blurred")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
     moving = bench.find_moving(config, decisions) if _may_mask(config) else None
@@ -198,38 +176,17 @@ class _Bench:
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
                     else FarContent.nothing())
         drifting = task.schedule.config.exposure != "off"
-        self.drift = (estimate_gains(task.train, scene.points, exposures=task.exposures) if drifting
+        self.drift = (estimate_gains(task.train, scene.points) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))
-        self.blur = (task.motions.find_blur(task.train)
-                     if task.motions is not None and task.schedule.config.blur != "off"
-                     else BlurEvidence.nothing())
         self._scores: dict[tuple[object, ...], list[float]] = {}
         self._states: dict[tuple[object, ...], TrainState] = {}
 
-    def light(self, config: RunConfig) -> PhotometricEvidence:
-        """Returns what the points show of vignettes and tone curves, where options ask for it."""
+    def vignettes(self, config: RunConfig) -> VignetteEvidence:
+        """Returns what the points show of vignettes, where options ask for it."""
         task = self._scene.task
-        if "auto" not in (config.vignette, config.tone):
-            return PhotometricEvidence.nothing(task.train)
-        return find_photometry(task.train, self._scene.points)
-
-    def shutter(self, config: RunConfig) -> float | None:
-        """Returns the shutter time in seconds that explains views best; None without evidence.
-
-        Without views to try it on, that of the evidence.
-        """
-        if self.blur.seconds == 0 or not (self.blur.speaks or config.blur == "on"):
-            return None
-        times = [factor * self.blur.seconds for factor in SHUTTERS]
-        if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
-            return times[0]
-        return max(times, key=lambda time: float(np.mean(self._run(
-            replace(config, blur="on", shutter=time), self._blur_level))))
-
-    @property
-    def _blur_level(self) -> int:
-        camera = self._scene.task.train[0].camera
-        return max(1, round(max(camera.width, camera.height) / _BLUR_SIDE))
+        if config.vignette != "auto":
+            return VignetteEvidence.nothing(task.train)
+        return find_vignettes(task.train, self._scene.points)
 
     def try_part(self, part: str, config: RunConfig, value: str) -> TrialDecision:
         """Returns whether a part pays on top of those that are on already."""
@@ -241,10 +198,9 @@ class _Bench:
             return skip_trial(part, "too few of the views to score see any of it")
 
         def scores(config: RunConfig) -> list[float]:
-            level = self._blur_level if part == "blur" else LEVEL
-            values = self._run(config, level)
-            if part in ("vignette", "tone"):  # brightness as filmed counts as much as all else
-                values = np.mean([values, self._run(config, level, as_is=True)], axis=0).tolist()
+            values = self._run(config)
+            if part == "vignette":  # brightness as filmed counts as much as all else
+                values = np.mean([values, self._run(config, as_is=True)], axis=0).tolist()
             return [values[i] for i in telling]
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
@@ -252,7 +208,7 @@ class _Bench:
         # Depth puts surfaces where they are, which the views of the path need not show.
         lenient = part == "depth" or (
             part == "far" and not look_at_one_thing(self._scene.task.train))
-        threshold = {"blur": BLUR_DB, "depth": DEPTH_DB}.get(part, THRESHOLD_DB)
+        threshold = DEPTH_DB if part == "depth" else THRESHOLD_DB
         return decide(part, (lambda: scores(without), lambda: scores(with_it)),
                       threshold_db=threshold, unless_worse=lenient)
 
@@ -274,9 +230,8 @@ class _Bench:
     def find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
         """Returns where each training and validation view shows what moves; None: no masks pay."""
         start, task = time.perf_counter(), self._scene.task
-        # That a view is blurred alike is no contradiction. Its render is compared as it is, so
-        # corners are as dark in the model as in the photos.
-        config = replace(config, blur="off", vignette="off")
+        # renders are compared as they are: corners are to be as dark in the model as in the photos
+        config = replace(config, vignette="off")
         if split(len(task.train), len(task.validation)) is None:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None
@@ -284,24 +239,13 @@ class _Bench:
         model = self.model(config, self._moving_level)
         order = np.argsort(self._scene.names) if self._scene.names else np.arange(len(views))
         rows = order[first_look(len(views))]
-        looked = judge.compare(model, [views[row] for row in rows])
-        moved = self._find_moved(model, views, judge, order) if was_moved(looked) else None
-        signs = find_signs(looked)
-        if config.moving == "on" or are_enough(signs):
-            if moved is not None:  # a model without its ghost
-                views = hide(views, moved)
-                model = self._probe(config, [view for view in views[:len(task.train)]
-                                             if leaves_enough(view.mask)], SIDE)
-            regions = search(
-                model, views, range(len(task.train)), judge, partial(self._probe, config))
-            regions = regions if moved is None else join(moved, regions)
-        elif moved is not None:
-            regions = moved
-        else:
+        signs = find_signs(judge.compare(model, [views[row] for row in rows]))
+        if config.moving != "on" and not are_enough(signs):
             decisions.append(replace(skip_trial(
                 "moving", f"{signs.sum()} of {len(signs)} views contradict the others"),
                 seconds=time.perf_counter() - start))
             return None
+        regions = search(model, views, range(len(task.train)), judge, partial(self._probe, config))
         if not any(region.any() for region in regions):
             decision = skip_trial("moving", "what contradicted other views was not found again")
         elif not is_plausible(regions):
@@ -314,18 +258,6 @@ class _Bench:
                 config, self.model(config, self._moving_level), hide(views, regions))
         decisions.append(replace(decision, seconds=time.perf_counter() - start))
         return regions if decision.on else None
-
-    @staticmethod
-    def _find_moved(
-        model: Splats, views: Sequence[TrainView], judge: Judge, order: NDArray[np.int64]
-    ) -> Regions:
-        """Returns where each view shows what was moved half-way in the rarer of its states."""
-        hidden = hide_rarer(judge.compare(model, [views[row] for row in order]))
-        regions = [hidden[place] for place in np.argsort(order)]
-        logger.info("moving: something was moved half-way; %.1f%% of the pixels of %d of %d views "
-                    "show where it was seen less", 100 * share_of(regions),
-                    sum(region.any() for region in regions), len(views))
-        return regions
 
     @property
     def _moving_level(self) -> int:
@@ -393,7 +325,7 @@ class _Bench:
         if (scored := (as_is, *key)) not in self._scores:
             state = self._states[key]
             self._scores[scored] = self._score(
-                state.splats, self._views()[1], short, level, self._held_out_motions(short),
+                state.splats, self._views()[1], short, level,
                 None if state.photometry is None else state.photometry.falloffs, as_is=as_is)
         return self._scores[scored]
 
@@ -415,29 +347,20 @@ class _Bench:
             train = [replace(twin, depth=view.depth)
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
         rows, _ = self._views()
-        motions = scene.task.motions and scene.task.motions.select(rows)
-        exposures = None if scene.task.exposures is None else scene.task.exposures[list(rows)]
-        return self._fit(config, [train[i] for i in rows], factor=level, motions=motions,
-                         exposures=exposures)
+        return self._fit(config, [train[i] for i in rows], factor=level)
 
     def _score(
         self, splats: Splats, views: Sequence[TrainView], config: RunConfig, level: int = LEVEL,
-        motions: Sequence[Motion | None] = (), falloffs: LensFalloffs | None = None,
-        *, as_is: bool = False,
+        falloffs: LensFalloffs | None = None, *, as_is: bool = False,
     ) -> list[float]:
-        """Returns the corrected PSNR in dB of each view, blurred by its motion where it has one."""
-        task, degree = self._scene.task, config.sh_degree
-        small = [reduce_view(view, level) for view in views]
+        """Returns the PSNR in dB of each view, after the best gain of each channel or as it is."""
         return [
-            mean_psnr(
-                splats, [view], degree, task.backend, corrected=not as_is, falloffs=falloffs)
-            if motion is None
-            else blurred_psnr(splats, view, motion, replace(task, schedule=Schedule(config)))
-            for view, motion in zip(small, motions or [None] * len(small), strict=True)]
+            mean_psnr(splats, [reduce_view(view, level)], config.sh_degree,
+                      self._scene.task.backend, corrected=not as_is, falloffs=falloffs)
+            for view in views]
 
     def _fit(
-        self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL,
-        motions: ViewMotions | None = None, exposures: NDArray[np.float64] | None = None,
+        self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL
     ) -> TrainState:
         """Returns the end of a short run on views reduced by a factor."""
         scene, task = self._scene, self._scene.task
@@ -448,22 +371,11 @@ class _Bench:
                                      means_rate=_FURTHER * recipe.means_rate)
         schedule = Schedule(config, recipe)
         small = Task([reduce_view(view, factor) for view in views], [], schedule, task.extent,
-                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo,
-                     motions=motions, exposures=exposures)
+                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
         fit(state, small, config.iterations)
         return state
-
-    def _held_out_motions(self, config: RunConfig) -> Sequence[Motion | None]:
-        """Returns the motions of the views to score; None for those that are scored as sharp."""
-        task = self._scene.task
-        chosen = split(len(task.train), len(task.validation))
-        assert chosen is not None
-        if config.blur != "on" or task.motions is None:
-            return [None] * len(chosen.held_out)
-        motions = task.motions.train if chosen.own else task.motions.validation
-        return [motions[i] for i in chosen.held_out]
 
 
 def short_model(scene: TrialScene, level: int = LEVEL) -> Splats:

@@ -17,7 +17,7 @@ def reasons(needs):
 def test_a_plain_scene_needs_nothing_and_pays_nothing():
     needs = examine(scene())
     assert needs.config.far == needs.config.exposure == "off"
-    assert needs.config.vignette == needs.config.tone == "off"
+    assert needs.config.vignette == "off"
     assert needs.seconds == 0
     assert needs.moving is None
     assert "cover all" in reasons(needs)["far"]
@@ -40,12 +40,10 @@ def test_a_camera_that_sets_its_exposure_is_found_and_helped():
 
 
 def test_a_lens_with_dark_corners_is_found_and_helped():
-    config = replace(CONFIG, tone="auto")
-    needs = examine(scene(vignette=(-0.5, -0.3), config=config))
+    needs = examine(scene(vignette=(-0.5, -0.3)))
     decision = next(one for one in needs.decisions if one.name == "vignette")
     assert decision.on, decision.reason
     assert needs.config.vignette == "on"
-    assert needs.config.tone == "off"
 
 
 def test_one_exposure_for_all_needs_no_trial_but_a_drift():
@@ -64,8 +62,7 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 def test_what_the_options_say_is_not_tried():
     config = replace(
-        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", blur="off",
-        vignette="off", tone="off")
+        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", vignette="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config
