@@ -3,9 +3,9 @@
 A part has a cheap sign that must speak for it first, then two short runs at a reduced size that
 differ in this part alone are scored on views that neither trained on. A part is off unless the
 trial shows a gain; far content in rooms, and the depth of a sensor, are on unless it shows a loss.
-What was switched on is part
-of the trials that follow. `tests/bench/bench_trials.py` holds the choices
-against runs of full length.
+What was switched on is part of the trials that follow. A trial that would not end in time is left
+out or cut, and the part is as it is without evidence; those that gain most come first.
+`tests/bench/bench_trials.py` holds the choices against runs of full length.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.context import TrainCallback
+from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
 from recon_cli.render.response import LensFalloffs
@@ -33,6 +35,7 @@ from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
 from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_search import (
+    FINER,
     Judge,
     Regions,
     are_enough,
@@ -46,7 +49,7 @@ from recon_cli.train.moving_search import (
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
-from recon_cli.train.trial_decisions import THRESHOLD_DB, decide, skip_trial, split
+from recon_cli.train.trial_decisions import NO_TIME, THRESHOLD_DB, decide, skip_trial, split
 from recon_cli.train.vignette_evidence import VignetteEvidence, find_vignettes
 from recon_cli.workspace.summaries import TrialDecision
 
@@ -79,9 +82,9 @@ class Needs:
     moving: Regions | None = None
 
     @property
-    def seconds(self) -> float:
-        """Spent on trials."""
-        return sum(decision.seconds for decision in self.decisions)
+    def untried(self) -> tuple[TrialDecision, ...]:
+        """The decisions for which there was no time."""
+        return tuple(one for one in self.decisions if one.reason == NO_TIME)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +99,7 @@ class TrialScene:
     harmonics: bool = False  # the degree of the colours is left to a trial
     # of the training views, then of the validation views; they sort as they were taken
     names: tuple[str, ...] = ()
+    deadline: Deadline = field(default_factory=Deadline)  # of all trials
 
 
 def examine(scene: TrialScene) -> Needs:
@@ -167,11 +171,25 @@ def _with(config: RunConfig, part: str, value: str) -> RunConfig:
     return replace(config, **changes)
 
 
+class _Pace(TrainCallback):
+    """Cuts a short run that would not end in time."""
+
+    def __init__(self, check: Callable[[int], None]) -> None:
+        self._check = check
+
+    def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
+        """Raises OutOfTime where the rest would take too long."""
+        self._check(iteration)
+
+
 class _Bench:
     """Short runs on the views of a scene."""
 
     def __init__(self, scene: TrialScene) -> None:
         self._scene, task = scene, scene.task
+        self._deadline = scene.deadline
+        self._longest = 0.0  # seconds of a run so far
+        self._runs = 1  # that must end in time, from the one that is next
         needs_far = task.schedule.config.far != "off"
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
                     else FarContent.nothing())
@@ -209,8 +227,18 @@ class _Bench:
         lenient = part == "depth" or (
             part == "far" and not look_at_one_thing(self._scene.task.train))
         threshold = DEPTH_DB if part == "depth" else THRESHOLD_DB
-        return decide(part, (lambda: scores(without), lambda: scores(with_it)),
-                      threshold_db=threshold, unless_worse=lenient)
+        try:
+            self._expect_runs(_key(without), _key(with_it))
+            return decide(part, (lambda: scores(without), lambda: scores(with_it)),
+                          threshold_db=threshold, unless_worse=lenient)
+        except OutOfTime:
+            return skip_trial(part, NO_TIME, on=lenient)
+
+    def _expect_runs(self, *keys: tuple[object, ...]) -> None:
+        """Raises OutOfTime where the runs of these keys that are not made yet would end too late.
+        """
+        self._runs = len(set(keys) - self._states.keys())
+        self._deadline.refuse_late(self._runs * self._longest)
 
     def degree(self, config: RunConfig, decisions: list[TrialDecision]) -> int:
         """Returns the lowest degree of the colours that the highest does not beat by enough."""
@@ -220,15 +248,29 @@ class _Bench:
             few = replace(config, sh_degree=low)
             # A gain need not be sure: after 3,000 steps all of twelve captures gained by harmonics,
             # and two left out for want of certainty lost .6 and 1.2 dB in longer runs.
-            decisions.append(decide(
-                f"harmonics above degree {low}",
-                (partial(self._run, few), partial(self._run, config)), errors=0))
+            name = f"harmonics above degree {low}"
+            try:
+                self._expect_runs(_key(few), _key(config))
+                decisions.append(decide(
+                    name, (partial(self._run, few), partial(self._run, config)), errors=0))
+            except OutOfTime:
+                decisions.append(skip_trial(name, NO_TIME, on=True))
+                return config.sh_degree
             if not decisions[-1].on:
                 return low
         return config.sh_degree
 
     def find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
         """Returns where each training and validation view shows what moves; None: no masks pay."""
+        if config.moving == "on":  # asked for, whatever it takes
+            self._deadline = Deadline()
+        try:
+            return self._find_moving(config, decisions)
+        except OutOfTime:
+            decisions.append(skip_trial("moving", NO_TIME))
+            return None
+
+    def _find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
         start, task = time.perf_counter(), self._scene.task
         # renders are compared as they are: corners are to be as dark in the model as in the photos
         config = replace(config, vignette="off")
@@ -236,15 +278,21 @@ class _Bench:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
+        self._expect_runs(_key(config, self._moving_level))
         model = self.model(config, self._moving_level)
         order = np.argsort(self._scene.names) if self._scene.names else np.arange(len(views))
         rows = order[first_look(len(views))]
+        begun = self._deadline.spent
         signs = find_signs(judge.compare(model, [views[row] for row in rows]))
+        each = (self._deadline.spent - begun) / len(rows)  # seconds of a view
         if config.moving != "on" and not are_enough(signs):
             decisions.append(replace(skip_trial(
                 "moving", f"{signs.sum()} of {len(signs)} views contradict the others"),
                 seconds=time.perf_counter() - start))
             return None
+        # the looks of the search are two like the first and a larger one, and it makes two models
+        self._deadline.refuse_late(
+            (2 + FINER**2) * each * len(views) + (1 + FINER) * self._longest)
         regions = search(model, views, range(len(task.train)), judge, partial(self._probe, config))
         if not any(region.any() for region in regions):
             decision = skip_trial("moving", "what contradicted other views was not found again")
@@ -370,11 +418,17 @@ class _Bench:
         recipe = dataclasses.replace(recipe, levels=(), replaced_at_once=0.0,
                                      means_rate=_FURTHER * recipe.means_rate)
         schedule = Schedule(config, recipe)
+        limited, begun = self._deadline.limited, self._deadline.spent
+        # the search for surfaces has a time of its own
+        stereo = None if limited else task.stereo
         small = Task([reduce_view(view, factor) for view in views], [], schedule, task.extent,
-                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo)
+                     task.backend, task.device, nearness=task.nearness, stereo=stereo)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
-        fit(state, small, config.iterations)
+        pace = self._deadline.keep_pace(config.iterations * max(1, self._runs))
+        fit(state, small, config.iterations, (_Pace(pace),) if limited else ())
+        self._longest = max(self._longest, self._deadline.spent - begun)
+        self._runs -= 1
         return state
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.deadline import Deadline
 from recon_cli.errors import TrainingError
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
@@ -101,16 +102,17 @@ def first_state(
         backend=task.backend, photometry=photometry)
 
 
-def surfaces_of(task: Task, sparse: int) -> SurfacePoints:
+def surfaces_of(task: Task, sparse: int, deadline: Deadline | None = None) -> SurfacePoints:
     """Returns the points by stereo that a run begins with, besides those of structure from motion.
 
     They fill what `sparse` points leave of half of the cap: the rest goes where the error is.
+    OutOfTime where a search for them would not end by the deadline.
     """
     config = task.schedule.config
     room = config.max_gaussians // 2 - sparse
     if config.stereo != "on" or task.stereo is None or room <= 0:
         return SurfacePoints.nothing()
-    return task.stereo.found.at_most(room, config.seed)
+    return task.stereo.search(deadline).at_most(room, config.seed)
 
 
 def restore_state(path: Path, task: Task) -> TrainState:
