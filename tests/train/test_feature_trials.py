@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from wall_scene import CONFIG, scene
 
+from recon_cli.deadline import Deadline
 from recon_cli.train.feature_trials import examine
 
 pytestmark = pytest.mark.integration
@@ -84,3 +85,35 @@ def test_the_same_scene_gets_the_same_answer():
     first, second = (examine(scene(window=True)) for _ in range(2))
     assert first.config == second.config
     assert [one.mean_db for one in first.decisions] == [one.mean_db for one in second.decisions]
+
+
+class Ticking:
+    """A clock that goes on at each look, which every step of a limited trial takes."""
+
+    def __init__(self, seconds):
+        self.now, self.seconds = 0.0, seconds
+
+    def __call__(self):
+        self.now += self.seconds
+        return self.now
+
+
+def test_trials_that_would_end_late_are_cut_and_parts_are_as_without_evidence():
+    clock = Ticking(0.05)
+    deadline = Deadline(15.0, clock)  # of some 400 steps; a trial takes 800
+    needs = examine(replace(scene(window=True, drift=0.15), deadline=deadline, harmonics=True))
+    assert [one.name for one in needs.untried] == [
+        "far", "exposure", "harmonics above degree 0", "moving"][:len(needs.untried)]
+    assert len(needs.untried) >= 3
+    assert (needs.config.far, needs.config.exposure) == ("on", "off")
+    assert needs.config.sh_degree == CONFIG.sh_degree
+    assert needs.moving is None
+    assert clock.now < 15
+
+
+def test_a_time_that_suffices_changes_no_decision():
+    free, limited = (examine(replace(scene(window=True), deadline=deadline))
+                     for deadline in (Deadline(), Deadline(1e6)))
+    assert free.config == limited.config
+    assert [one.mean_db for one in free.decisions] == [one.mean_db for one in limited.decisions]
+    assert limited.untried == ()
