@@ -18,7 +18,7 @@ from recon_cli import machine
 from recon_cli.commands.jobs import open_job, run_stages
 from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config.settings import Settings, build, merge
-from recon_cli.config.stages import TrainConfig
+from recon_cli.config.stages import IngestConfig, TrainConfig
 from recon_cli.deadline import Clock, Deadline
 from recon_cli.errors import ReconError
 from recon_cli.sfm.time_estimate import Workload, expected_seconds, measure_slowness
@@ -28,6 +28,7 @@ from recon_cli.workspace.summaries import IngestSummary, JsonRecord, TrainSummar
 
 FILE = "budget.json"
 LEAST_FRAMES = 24
+_INGEST = 0.1  # seconds of one core to read a picture of a video, a megapixel
 _SFM = 0.4  # of the time that is left after ingest beside scores, at most
 _PRUNE = 0.45  # of the seconds of training, set aside
 _LATE = 1.15  # of the minutes, from which the user is told
@@ -43,7 +44,7 @@ class Budget(JsonRecord):
 
     minutes: float
     inputs: tuple[str, ...]  # absolute paths
-    frames: int | None = None  # that ingest chooses; None: as many as without a budget
+    max_frames: int | None = None  # of ingest; None: as without a budget
     train_minutes: float | None = None
     prune: bool | None = None
 
@@ -70,17 +71,20 @@ def run_within(
         run_stages(call, "run", names, sources=inputs if "ingest" in names else (), base=merge(
             [base, *chosen.values()]))
 
-    call.deadline = Deadline(_SFM * left(), clock)
     if budget is None:
-        stages("ingest")
-        fewer, call.deadline = None, Deadline(_SFM * left(), clock)
-        if given.get("ingest", {}).get("frames") is None:
-            fewer = _fewer_frames(workspace, call.deadline.seconds, threads, slowness)
+        most = None
+        if not {"frames", "max_frames"} & given.get("ingest", {}).keys():
+            # before anything is read, as a second reading takes as long as the first
+            most = _most_frames(inputs, left(), threads, slowness)
         budget = Budget(
-            minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), frames=fewer)
+            minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), max_frames=most)
         write_json(workspace.root / FILE, budget.to_json())
-    frames: Settings = {} if budget.frames is None else {"ingest": {"frames": budget.frames}}
-    stages("ingest", "denoise", "sfm", frames=frames)
+    frames: Settings = ({} if budget.max_frames is None
+                        else {"ingest": {"max_frames": budget.max_frames}})
+    stages("ingest", frames=frames)
+    call.deadline = Deadline(_SFM * left(), clock)
+    _report_frames(workspace, budget, call.deadline.seconds, threads, slowness)
+    stages("denoise", "sfm", frames=frames)
     if budget.train_minutes is None:
         seconds = left() / (1 + _PRUNE) if with_prune else left()
         seconds = max(seconds, _LEAST_TRAINING * slowness)
@@ -114,30 +118,50 @@ def _recorded(call: Call, minutes: float, inputs: tuple[Path, ...]) -> Budget | 
     return found if same and found.minutes == minutes else None
 
 
-def _fewer_frames(
-    workspace: Workspace, seconds: float, threads: int, slowness: float
+def _most_frames(
+    inputs: tuple[Path, ...], left: float, threads: int, slowness: float
 ) -> int | None:
-    """Returns to how many frames a capture is cut for cameras in time; None: it stays."""
+    """Returns how many frames of videos have cameras in time; None where the inputs are no videos.
+    """
+    from recon_cli.capture.video import open_video, read_declared_length  # imports PyAV
+
+    pictures, megapixels = 0.0, 0.0
+    try:
+        for path in inputs:
+            length = read_declared_length(path)
+            pictures += length.count(length.rate)
+            with open_video(path) as (_, stream):
+                megapixels = max(megapixels, stream.width * stream.height / 1e6)
+    except ReconError:  # ingest says what they are, or what is wrong with them
+        return None
+    longest = IngestConfig().max_size ** 2 * 9 / 16 / 1e6  # megapixels of a stored frame
+    reading = _INGEST * pictures * megapixels * slowness / threads
+    seconds = _SFM * (left - reading)
+    frames = IngestConfig().max_frames
+    while frames > LEAST_FRAMES and expected_seconds(
+            Workload(frames, min(megapixels, longest), tracked=True), threads,
+            slowness=slowness) > seconds:
+        frames = max(LEAST_FRAMES, int(0.95 * frames))
+    return frames
+
+
+def _report_frames(
+    workspace: Workspace, budget: Budget, seconds: float, threads: int, slowness: float
+) -> None:
+    """Says that fewer frames are used than without a budget, or that more are than it has time for.
+    """
     manifest = workspace.manifest("ingest")
     assert manifest is not None
     ingested = IngestSummary.from_json(manifest.run.summary)
-    if ingested.metric is not None:
-        return None  # its cameras are known
-    megapixels = ingested.width * ingested.height / 1e6
-
-    def estimate(frames: int) -> float:
-        return expected_seconds(
-            Workload(frames, megapixels, ingested.kind == "video"), threads, slowness=slowness)
-
-    frames = ingested.frames
-    if estimate(frames) <= seconds:
-        return None
-    while frames > LEAST_FRAMES and estimate(frames) > seconds:
-        frames = max(LEAST_FRAMES, int(0.95 * frames))
-    logger.warning(
-        "%d of %d frames are used, so that the run ends within --minutes; --frames keeps more",
-        frames, ingested.frames)
-    return frames
+    if ingested.frames == budget.max_frames:
+        logger.warning("no more than %d frames are used, so that the run ends within --minutes; "
+                       "--frames keeps more", ingested.frames)
+    expected = expected_seconds(
+        Workload(ingested.frames, ingested.width * ingested.height / 1e6,
+                 ingested.kind == "video"), threads, slowness=slowness)
+    if ingested.kind != "video" and ingested.metric is None and expected > 2 * seconds:
+        logger.warning("the cameras of %d photos take about %.1f of the %g minutes: fewer photos "
+                       "leave more for training", ingested.frames, expected / 60, budget.minutes)
 
 
 def _pruning_seconds(workspace: Workspace) -> float:

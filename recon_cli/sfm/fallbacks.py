@@ -176,12 +176,15 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
 
 
 def _unneeded_minutes(job: MappingJob, attempts: Sequence[MapperAttempt]) -> float:
-    """Returns by how much sooner than --max-minutes the search ends with what it has found."""
-    if job.spare_minutes is None or not any(
-            attempt.trusted and len(attempt.registered) >= job.min_registered * len(job.names)
-            for attempt in attempts):
+    """Returns by how much sooner than --max-minutes the search ends with what it has found.
+
+    A model that lacks many frames is worth as much time again.
+    """
+    held = max((len(attempt.registered) for attempt in attempts if attempt.trusted), default=0)
+    if job.spare_minutes is None or held < job.min_registered * len(job.names):
         return 0.0
-    return max(0.0, job.max_minutes - job.spare_minutes)
+    enough = held >= ENOUGH_FRAMES * len(job.names)
+    return max(0.0, job.max_minutes - job.spare_minutes * (1 if enough else 2))
 
 
 def _begin_with_fisheye(

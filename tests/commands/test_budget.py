@@ -24,21 +24,21 @@ class FakeRun:
         self.pruning, self.training = pruning, 0.0
         for name, value in {
                 "run_stages": self.run, "measure_slowness": lambda _: SLOWNESS,
-                "_fewer_frames": self.choose_frames,
+                "_most_frames": self.choose_frames, "_report_frames": lambda *_: None,
                 "_pruning_seconds": lambda _: self.pruning * self.training}.items():
             monkeypatch.setattr(budget, name, value)
 
     def __call__(self):
         return self.now
 
-    def choose_frames(self, _workspace, seconds, *_):
-        self.camera_seconds = seconds
+    def choose_frames(self, _inputs, left, *_):
+        self.left_at_first = left
         return 60
 
     def run(self, call, _verb, stages, *, base, **_):
         for stage in stages:
-            if stage in self.ran and stage == "ingest" and "frames" not in base["ingest"]:
-                continue
+            if stage == "ingest":
+                assert base["ingest"] == {"max_frames": 60}
             if stage == "sfm":
                 self.sfm_left = call.deadline.left
             self.ran.append(stage)
@@ -64,16 +64,17 @@ def test_the_parts_of_a_run_add_up_to_its_minutes(tmp_path, monkeypatch, minutes
     chosen = run(tmp_path, clock, minutes)
     assert 0.85 <= clock.now / (60 * minutes) <= 1.15
     assert chosen["prune"] is True
-    assert chosen["frames"] == 60
+    assert chosen["max_frames"] == 60
+    assert clock.ran.count("ingest") == 1
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
 def test_cameras_get_a_share_of_what_ingest_left(tmp_path, monkeypatch):
     clock = FakeRun(monkeypatch, {**USUAL, "ingest": 30.0})
     run(tmp_path, clock, 4.0)
-    left = 240 - 30 - budget._SCORES * SLOWNESS
-    assert clock.camera_seconds == pytest.approx(budget._SFM * left)
-    assert clock.sfm_left <= clock.camera_seconds
+    scores = budget._SCORES * SLOWNESS
+    assert clock.left_at_first == pytest.approx(240 - scores)
+    assert clock.sfm_left == pytest.approx(budget._SFM * (240 - 30 - scores) - USUAL["denoise"])
 
 
 def test_pruning_that_has_no_time_is_left_out_and_said(tmp_path, monkeypatch, caplog):

@@ -296,6 +296,14 @@ def test_late_mappers_improve_no_model_that_is_enough_but_replace_one_that_is_no
     assert result.parts[0].registered == job.names
 
 
+@pytest.mark.parametrize(("held", "trusted", "minutes"), [
+    (58, True, 17.0), (40, True, 14.0), (40, False, 0.0), (20, True, 0.0)])
+def test_a_model_that_lacks_frames_is_worth_more_of_the_time(capture, held, trusted, minutes):
+    job = replace(sized(capture[0], 60), max_minutes=20.0, spare_minutes=3.0)
+    attempt = replace(GOOD, registered=NAMES[:held], trusted=trusted)
+    assert fallbacks._unneeded_minutes(job, [attempt]) == minutes
+
+
 def test_a_job_has_less_time_left_after_some_of_it(capture):
     job = replace(capture[0], max_minutes=20.0, spare_minutes=3.0)
     assert (job.after(2.0).max_minutes, job.after(2.0).spare_minutes) == (18.0, 1.0)
