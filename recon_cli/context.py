@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recon_cli.deadline import Deadline
 from recon_cli.progress import NullProgress, Progress
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ class StageContext:
     max_memory_bytes: int | None = None  # that a stage may take; None: all that is free
     scratch: Path | None = None  # folder for files without a name; None: the system's
     compute: ComputeConfig | None = None  # as typed, for work on other machines; None: as here
+    deadline: Deadline = field(default_factory=Deadline)  # for what the stage may do without
 
     name_photos: Callable[[str], str] = str  # calls them in a text by the names of their files
 

@@ -13,13 +13,14 @@ from recon_cli.stages import STAGES
 MAX_LINES = 500
 
 # Each part of the package (a module or folder at its top) and the parts that it may import.
-BASE = {"errors", "progress", "machine", "processes", "signals"}
+BASE = {"deadline", "errors", "progress", "machine", "processes", "signals"}
 RECORDS = BASE | {"workspace", "config", "scene"}
 READ = RECORDS | {"io"}
 DRAW = READ | {"context", "kernels", "render", "evaluation", "stereo", "splats"}
 MAKE = DRAW | {"capture", "datasets", "jobs", "room", "sfm", "train", "export", "trust", "stages"}
 RUN = MAKE | {"pipeline"}
 ALLOWED: dict[str, set[str]] = {
+    "deadline": set(),
     "errors": set(),
     "processes": set(),
     "signals": {"errors"},
@@ -29,7 +30,7 @@ ALLOWED: dict[str, set[str]] = {
     "scene": {"errors"},
     "workspace": {"errors", "scene"},
     "config": {"errors", "workspace"},
-    "context": {"config", "progress", "scene"},
+    "context": {"config", "deadline", "progress", "scene"},
     "kernels": {"machine", "scene"},
     "render": {"errors", "kernels", "machine", "scene"},
     "io": {"errors", "signals", "workspace", "scene"},

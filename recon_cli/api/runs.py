@@ -16,6 +16,7 @@ from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import TrainCallback
+from recon_cli.deadline import Deadline
 from recon_cli.errors import ConfigError
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.continuation import Start
@@ -40,6 +41,7 @@ class RunRequest:
     from_import: bool = False  # training continues the imported scene
     callbacks: tuple[TrainCallback, ...] = ()  # called while Gaussians are trained
     table: tuple[Stage, ...] = ()  # of all stages; empty for that of the workspace
+    deadline: Deadline = field(default_factory=Deadline)  # for what stages may do without
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class OpenWorkspace:
         compute = configs["compute"]
         assert isinstance(compute, ComputeConfig)
         job = Job(Workspace(self.path), explicit, compute, self.progress, report,
-                  request.table or self.table, request.callbacks)
+                  request.table or self.table, request.callbacks, deadline=request.deadline)
         start = Start.IMPORTED if request.from_import else Start.AUTO
         targets = [
             Target(row.name, configs[layers.section_of(row.config)],

@@ -1,8 +1,9 @@
 """`recon run --minutes M`: a time for the whole run, spent by how fast this machine is.
 
-Frames are chosen so that finding their cameras takes a fixed share of the time; training takes as
-long as then is left beside pruning and scores; pruning is left out where there is no time for it.
-The choices are recorded, so that the same command continues a run and finds a finished one fresh.
+Frames are chosen so that finding their cameras takes a fixed share of the time, and after it no
+other mapper improves on cameras that can be trusted; training takes as long as then is left beside
+pruning and scores; pruning is left out where there is no time for it. The choices are recorded, so
+that the same command continues a run and finds a finished one fresh.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from recon_cli import machine
 from recon_cli.commands.jobs import open_job, run_stages
 from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config.settings import Settings, build, merge
-from recon_cli.config.stages import TrainConfig
+from recon_cli.config.stages import IngestConfig, TrainConfig
+from recon_cli.deadline import Clock, Deadline
 from recon_cli.errors import ReconError
 from recon_cli.sfm.time_estimate import Workload, expected_seconds, measure_slowness
 from recon_cli.workspace.atomic import read_json, write_json
@@ -26,9 +28,10 @@ from recon_cli.workspace.summaries import IngestSummary, JsonRecord, TrainSummar
 
 FILE = "budget.json"
 LEAST_FRAMES = 24
-_SFM = 0.4  # of the time, at most
-# Pruning midway continues with half of the Gaussians through the last two fifths of the steps.
-_PRUNE = 0.45  # of the seconds of training
+_INGEST = 0.1  # seconds of one core to read a picture of a video, a megapixel
+_SFM = 0.4  # of the time that is left after ingest beside scores, at most
+_PRUNE = 0.45  # of the seconds of training, set aside
+_LATE = 1.15  # of the minutes, from which the user is told
 _SCORES = 20.0  # seconds of evaluate, export and report, on the machine of sfm.time_estimate
 _LEAST_TRAINING = 12.0  # seconds, likewise
 
@@ -41,16 +44,17 @@ class Budget(JsonRecord):
 
     minutes: float
     inputs: tuple[str, ...]  # absolute paths
-    frames: int | None = None  # that ingest chooses; None: as many as without a budget
+    max_frames: int | None = None  # of ingest; None: as without a budget
     train_minutes: float | None = None
     prune: bool | None = None
 
 
 def run_within(
-    call: Call, minutes: float, inputs: tuple[Path, ...], base: Settings, *, with_prune: bool
+    call: Call, minutes: float, inputs: tuple[Path, ...], base: Settings, *, with_prune: bool,
+    clock: Clock = time.monotonic,
 ) -> None:
     """Runs every stage in about so many minutes, and says what is given up for it."""
-    began = time.monotonic()
+    deadline = Deadline(60 * minutes, clock)
     workspace = Workspace(call.workspace)
     given = merge([explicit_settings(call), call.settings])
     # what contradicts a time, such as a number of steps, is refused before anything runs
@@ -60,41 +64,45 @@ def run_within(
     slowness = measure_slowness(threads)
 
     def left() -> float:
-        return 60 * minutes - (time.monotonic() - began)
+        """Returns the seconds that are left beside those of evaluate, export and report."""
+        return deadline.left - _SCORES * slowness
 
     def stages(*names: str, **chosen: Settings) -> None:
         run_stages(call, "run", names, sources=inputs if "ingest" in names else (), base=merge(
             [base, *chosen.values()]))
 
     if budget is None:
-        stages("ingest")
-        fewer = None
-        if given.get("ingest", {}).get("frames") is None:
-            fewer = _fewer_frames(workspace, _SFM * 60 * minutes, threads, slowness)
+        most = None
+        if not {"frames", "max_frames"} & given.get("ingest", {}).keys():
+            # before anything is read, as a second reading takes as long as the first
+            most = _most_frames(inputs, left(), threads, slowness)
         budget = Budget(
-            minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), frames=fewer)
+            minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), max_frames=most)
         write_json(workspace.root / FILE, budget.to_json())
-    frames: Settings = {} if budget.frames is None else {"ingest": {"frames": budget.frames}}
-    stages("ingest", "denoise", "sfm", frames=frames)
+    frames: Settings = ({} if budget.max_frames is None
+                        else {"ingest": {"max_frames": budget.max_frames}})
+    stages("ingest", frames=frames)
+    call.deadline = Deadline(_SFM * left(), clock)
+    _report_frames(workspace, budget, call.deadline.seconds, threads, slowness)
+    stages("denoise", "sfm", frames=frames)
     if budget.train_minutes is None:
-        rest = left() - _SCORES * slowness
-        seconds = max(rest / (1 + _PRUNE) if with_prune else rest, _LEAST_TRAINING * slowness)
+        seconds = left() / (1 + _PRUNE) if with_prune else left()
+        seconds = max(seconds, _LEAST_TRAINING * slowness)
         budget = dataclasses.replace(budget, train_minutes=round(seconds / 60, 2))
         write_json(workspace.root / FILE, budget.to_json())
     training: Settings = {"train": {"minutes": budget.train_minutes}}
     stages("train", frames=frames, training=training)
     if budget.prune is None:
-        budget = dataclasses.replace(budget, prune=with_prune and _has_time_to_prune(
-            workspace, left() - _SCORES * slowness))
+        budget = dataclasses.replace(
+            budget, prune=with_prune and left() > _pruning_seconds(workspace))
         write_json(workspace.root / FILE, budget.to_json())
         if with_prune and not budget.prune:
             logger.warning("there is no time to prune in %g minutes: the scene keeps all its "
                            "Gaussians; `recon prune` removes some", minutes)
     stages(*["prune"] * bool(budget.prune), "evaluate", "export", frames=frames, training=training)
-    taken = time.monotonic() - began
-    if taken > 1.2 * 60 * minutes:
-        logger.warning("the run took %.1f minutes, more than the %g of --minutes: the smallest "
-                       "training takes that long here", taken / 60, minutes)
+    if deadline.spent > _LATE * deadline.seconds:
+        logger.warning("the run took %.1f minutes, more than the %g of --minutes",
+                       deadline.spent / 60, minutes)
 
 
 def _recorded(call: Call, minutes: float, inputs: tuple[Path, ...]) -> Budget | None:
@@ -110,34 +118,60 @@ def _recorded(call: Call, minutes: float, inputs: tuple[Path, ...]) -> Budget | 
     return found if same and found.minutes == minutes else None
 
 
-def _fewer_frames(
-    workspace: Workspace, seconds: float, threads: int, slowness: float
+def _most_frames(
+    inputs: tuple[Path, ...], left: float, threads: int, slowness: float
 ) -> int | None:
-    """Returns to how many frames a capture is cut for cameras in time; None: it stays."""
-    manifest = workspace.manifest("ingest")
-    assert manifest is not None
-    ingested = IngestSummary.from_json(manifest.run.summary)
-    if ingested.metric is not None:
-        return None  # its cameras are known
-    megapixels = ingested.width * ingested.height / 1e6
+    """Returns how many frames of videos have cameras in time; None where the inputs are no videos.
+    """
+    from recon_cli.capture.video import open_video, read_declared_length  # imports PyAV
 
-    def estimate(frames: int) -> float:
-        return expected_seconds(
-            Workload(frames, megapixels, ingested.kind == "video"), threads, slowness=slowness)
-
-    frames = ingested.frames
-    if estimate(frames) <= seconds:
+    pictures, megapixels = 0.0, 0.0
+    try:
+        for path in inputs:
+            length = read_declared_length(path)
+            pictures += length.count(length.rate)
+            with open_video(path) as (_, stream):
+                megapixels = max(megapixels, stream.width * stream.height / 1e6)
+    except ReconError:  # ingest says what they are, or what is wrong with them
         return None
-    while frames > LEAST_FRAMES and estimate(frames) > seconds:
+    longest = IngestConfig().max_size ** 2 * 9 / 16 / 1e6  # megapixels of a stored frame
+    reading = _INGEST * pictures * megapixels * slowness / threads
+    seconds = _SFM * (left - reading)
+    frames = IngestConfig().max_frames
+    while frames > LEAST_FRAMES and expected_seconds(
+            Workload(frames, min(megapixels, longest), tracked=True), threads,
+            slowness=slowness) > seconds:
         frames = max(LEAST_FRAMES, int(0.95 * frames))
-    logger.warning(
-        "%d of %d frames are used, so that the run ends within --minutes; --frames keeps more",
-        frames, ingested.frames)
     return frames
 
 
-def _has_time_to_prune(workspace: Workspace, left: float) -> bool:
+def _report_frames(
+    workspace: Workspace, budget: Budget, seconds: float, threads: int, slowness: float
+) -> None:
+    """Says that fewer frames are used than without a budget, or that more are than it has time for.
+    """
+    manifest = workspace.manifest("ingest")
+    assert manifest is not None
+    ingested = IngestSummary.from_json(manifest.run.summary)
+    if ingested.frames == budget.max_frames:
+        logger.warning("no more than %d frames are used, so that the run ends within --minutes; "
+                       "--frames keeps more", ingested.frames)
+    expected = expected_seconds(
+        Workload(ingested.frames, ingested.width * ingested.height / 1e6,
+                 ingested.kind == "video"), threads, slowness=slowness)
+    if ingested.kind != "video" and ingested.metric is None and expected > 2 * seconds:
+        logger.warning("the cameras of %d photos take about %.1f of the %g minutes: fewer photos "
+                       "leave more for training", ingested.frames, expected / 60, budget.minutes)
+
+
+def _pruning_seconds(workspace: Workspace) -> float:
+    """Returns about how long the pruning of a finished model takes, by the steps of its training.
+    """
+    from recon_cli.train.prune_run import count_recovery_steps  # imports torch
+
     manifest = workspace.manifest("train")
     assert manifest is not None
     training = TrainSummary.from_json(manifest.run.summary)
-    return bool(training.gaussians) and left > 0.6 * _PRUNE * manifest.run.seconds
+    steps = count_recovery_steps(training.planned_iterations, training.training_views)
+    step = training.train_seconds / max(1, training.iterations)
+    return manifest.run.seconds - training.train_seconds + steps * step

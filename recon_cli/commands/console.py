@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from recon_cli import progress
-from recon_cli.config.settings import SECTIONS
+from recon_cli.config.settings import GONE, SECTIONS
 from recon_cli.errors import ExitCode
 from recon_cli.progress import hide_bars
 
@@ -213,11 +213,18 @@ def usage_hint(error: click.ClickException) -> str:
     if isinstance(error, HintedUsageError):
         return error.hint
     if isinstance(error, click.NoSuchOption):
-        found = _setting(error)
+        found = _gone(error) or _setting(error)
         if found:
             return found
     ctx = error.ctx if isinstance(error, click.UsageError) else None
     return f"See `{ctx.command_path} --help`." if ctx else ""
+
+
+def _gone(error: click.NoSuchOption) -> str:
+    """Returns what to do about an option that earlier versions had; empty for any other."""
+    name = error.option_name.lstrip("-").replace("-", "_")
+    gone = any(name in fields for fields in GONE.values())
+    return f"recon no longer has {error.option_name}: leave it out." if gone else ""
 
 
 def _setting(error: click.NoSuchOption) -> str:

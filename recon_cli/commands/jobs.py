@@ -38,7 +38,8 @@ def run_stages(
     """
     request = RunRequest(
         verb, tuple(stages), sources, base or {}, call.settings, forced or {}, again=call.again,
-        from_import=call.from_import, callbacks=callbacks, table=tuple(table))
+        from_import=call.from_import, callbacks=callbacks, table=tuple(table),
+        deadline=call.deadline)
     workspace = open_workspace(call)
     if call.print_config:
         click.echo(layers.to_toml(workspace.resolve(request)), nl=False)

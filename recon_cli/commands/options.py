@@ -29,6 +29,7 @@ from recon_cli.config.settings import (
     section_of,
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
+from recon_cli.deadline import Deadline
 from recon_cli.jobs.executor import CORES
 from recon_cli.workspace.export_formats import READABLE
 from recon_cli.workspace.paths import refuse_special
@@ -54,6 +55,7 @@ class Call(Style):
     print_config: bool = False
     settings: Settings = field(default_factory=dict)  # given as options of their own
     assigned: Settings = field(default_factory=dict)  # given by --set
+    deadline: Deadline = field(default_factory=Deadline)  # for what stages may do without
 
 
 pass_call = click.make_pass_decorator(Call, ensure=True)

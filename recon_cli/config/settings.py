@@ -43,7 +43,8 @@ SECTIONS: dict[str, type[StageConfig]] = {
 # version, as `--print-config` wrote it, still means the same.
 GONE: dict[str, dict[str, tuple[Any, ...]]] = {
     "denoise": {"filter": ("bilateral",)},
-    "train": {"poses": ("auto", "off"), "densify_scale": (0.01,)},
+    "train": {"poses": ("auto", "off"), "densify_scale": (0.01,), "tone": ("off",),
+              "blur": ("auto", "off"), "shutter": ()},
     "merge": {"validation": (0.05,)},
     "export": {"drop_backdrop": (False,)},
 }
@@ -154,13 +155,16 @@ def check_names(section: str, names: Iterable[str], *, where: str) -> None:
             hint=_suggest(section, list(SECTIONS), "Sections:"))
     known = [item.name for item in dataclasses.fields(SECTIONS[section])]
     for name in names:
+        if name in GONE.get(section, {}):
+            raise ConfigError(
+                f"{where} sets {section}.{name}, which recon no longer has.",
+                hint=_SUCCESSORS.get((section, name)) or (
+                    f"Delete the line {name} = ... below [{section}] in a file, and leave out "
+                    f"--set {section}.{name}."))
         if name not in known:
             raise ConfigError(
                 f"{where} sets {section}.{name}, which does not exist.",
-                hint=_SUCCESSORS.get((section, name),
-                                     "It is gone since an earlier version: leave it out.")
-                if name in GONE.get(section, {}) else
-                _suggest(name, known, f"Options of [{section}]:"))
+                hint=_suggest(name, known, f"Options of [{section}]:"))
 
 
 def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> None:

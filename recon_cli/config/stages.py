@@ -221,9 +221,6 @@ class TrainConfig(StageConfig):
     vignette: str = option(
         "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
         choices=("auto", "on", "off"), late=True, expert=True)
-    tone: str = option(
-        "off", "A tone curve per image; auto: by a trial.",
-        choices=("auto", "on", "off"), late=True, expert=True)
     depth: str = option(
         "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
         "budget, unless a trial shows a loss.",
@@ -234,13 +231,6 @@ class TrainConfig(StageConfig):
     look: str = option(
         "walk", "Brightness: as filmed, or even.", choices=("walk", "even"),
         late=True)
-    blur: str = option(
-        "auto", "Compare blurred views with renders that are blurred by the camera's way, so that "
-        "the scene is sharp; auto: by a trial.",
-        choices=("auto", "on", "off"), expert=True, late=True)
-    shutter: float | None = option(
-        None, "Time for which the shutter was open, for --blur.", unit="seconds", minimum=1e-5,
-        automatic="by a trial", expert=True, late=True)
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -335,7 +325,7 @@ class RunConfig(SettledConfig):
                  "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
                  "sh_rate")
         return self.densify == "reference" and (
-            "on" not in (self.depth, self.vignette, self.tone)) and all(
+            "on" not in (self.depth, self.vignette)) and all(
             getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 

@@ -309,7 +309,7 @@ class Runner:
         points = run_trial(loaded, run, score_at, on_step=on_step)
         config = loaded.task(run).schedule.config
         parts = [f"{config.images} images", f"degree {config.sh_degree}",
-                 *(name for name in ("far", "stereo", "exposure", "vignette", "tone", "depth")
+                 *(name for name in ("far", "stereo", "exposure", "vignette", "depth")
                    if getattr(config, name) == "on")]
         record = Record(points, self._machine, ", ".join(parts))
         if self._records:

@@ -10,7 +10,6 @@ import numpy as np
 
 from recon_cli.io import depth_maps
 from recon_cli.io.colmap import read_scene
-from recon_cli.scene.motion import Moment
 from recon_cli.scene.scene import Scene
 from recon_cli.workspace.records import read_frame_list
 from recon_cli.workspace.summaries import WorldSummary
@@ -35,11 +34,5 @@ def load_scene(
     world = WorldSummary.read(sfm)
     up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
     ingest = folders["ingest"]
-    frames = read_frame_list(ingest).frames
-    moments = {frame.name: Moment(frame.source, frame.time_seconds)
-               for frame in frames if frame.time_seconds is not None}
-    exposures = {frame.name: frame.exposure_ev
-                 for frame in frames if frame.exposure_ev is not None}
     return dataclasses.replace(
-        scene, up=up, moments=moments, exposures=exposures,
-        depth=ingest if (ingest / depth_maps.LIST).exists() else None)
+        scene, up=up, depth=ingest if (ingest / depth_maps.LIST).exists() else None)

@@ -18,6 +18,7 @@ from recon_cli.config.fields import StageConfig
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import EarlierResult, StageContext, StageInputs, TrainCallback
+from recon_cli.deadline import Deadline
 from recon_cli.errors import ConfigError, InputError, ManifestError, ReconError
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
@@ -56,6 +57,7 @@ class Job:
     # called while Gaussians are trained; they do not affect the result
     callbacks: tuple[TrainCallback, ...] = ()
     asked: tuple[str, ...] = ()  # the stages that run, where that is known
+    deadline: Deadline = field(default_factory=Deadline)  # for what stages may do without
 
     def inspect(self) -> WorkspaceCheck:
         """Returns the checks of the workspace as it is now."""
@@ -264,9 +266,10 @@ def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> S
         context = render_context(job.compute, job.progress)
         return dataclasses.replace(
             context, record=record, callbacks=job.callbacks, scratch=job.workspace.partial(""),
-            compute=job.compute)
+            compute=job.compute, deadline=job.deadline)
     threads = job.compute.threads or machine.usable_threads()
-    return StageContext(progress=job.progress, threads=threads, record=record)
+    return StageContext(
+        progress=job.progress, threads=threads, record=record, deadline=job.deadline)
 
 
 def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:

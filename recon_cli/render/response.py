@@ -1,9 +1,9 @@
-"""How a camera answers to the light of a view: vignette, gain and tone curve of its photograph.
+"""How a camera answers to the light of a view: vignette and gain of its photograph.
 
-    u = g v(s) x,   v = exp(a s + b s^2),   y = u + t c (1 - c),   c = u held to [0, 1]
+    y = g v(s) x,   v = exp(a s + b s^2)
 
 of a rendered value x; s is the squared distance of a pixel from the principal point over that of
-the farthest corner. The curve keeps black and white, and rises everywhere for |t| < 1.
+the farthest corner.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ class Response:
 
     gain: NDArray[np.float32]  # [3] factors of the channels
     vignette: tuple[float, float] | None = None  # a and b; None for no vignette
-    bend: float | None = None  # t; None for a straight curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +37,11 @@ class ResponseGradient:
 
     log_gain: NDArray[np.float64]  # [3]
     vignette: NDArray[np.float64]  # [2], by a and b
-    bend: float
 
     @staticmethod
     def zeros() -> ResponseGradient:
         """Returns the gradient of what has no influence."""
-        return ResponseGradient(np.zeros(3), np.zeros(2), 0.0)
+        return ResponseGradient(np.zeros(3), np.zeros(2))
 
 
 def squared_distances(camera: Camera) -> NDArray[np.float32]:
@@ -99,12 +97,10 @@ class ResponseTensors:
 
     def __init__(self, response: Response, camera: Camera, like: Tensor) -> None:
         self._log_gain = torch.from_numpy(response.gain).to(like).log().requires_grad_()
-        self._vignette = self._bend = None
+        self._vignette: Tensor | None = None
         if response.vignette is not None:
             self._vignette = like.new_tensor(response.vignette).requires_grad_()
             self._squares = torch.from_numpy(squared_distances(camera).copy()).to(like)[..., None]
-        if response.bend is not None:
-            self._bend = like.new_tensor(response.bend).requires_grad_()
 
     def apply(self, rgb: Tensor) -> Tensor:
         """Returns the photograph of a render [H, W, 3]."""
@@ -112,11 +108,7 @@ class ResponseTensors:
         if self._vignette is not None:
             a, b = self._vignette
             exponent = exponent + self._squares * (a + b * self._squares)
-        image = rgb * exponent.exp()
-        if self._bend is None:
-            return image
-        inside = image.clamp(0, 1)
-        return image + self._bend * inside * (1 - inside)
+        return rgb * exponent.exp()
 
     def gradient(self) -> ResponseGradient:
         """Returns the gradients that a backward pass left."""
@@ -125,8 +117,7 @@ class ResponseTensors:
                 return np.zeros(size)
             return np.asarray(leaf.grad.cpu().double().numpy()).reshape(size)
 
-        return ResponseGradient(found(self._log_gain, 3), found(self._vignette, 2),
-                                float(found(self._bend, 1)[0]))
+        return ResponseGradient(found(self._log_gain, 3), found(self._vignette, 2))
 
 
 class ResponsePass:
@@ -134,7 +125,6 @@ class ResponsePass:
 
     def __init__(self, response: Response, camera: Camera) -> None:
         self._response, self._camera = response, camera
-        self._unbent: NDArray[np.float32] | None = None
         if response.vignette is None:
             self._factor = np.tile(response.gain, camera.width)  # whole rows: ten times faster
         else:
@@ -144,28 +134,15 @@ class ResponsePass:
     def forward(self, image: NDArray[np.float32]) -> None:
         """Turns a render [H, W * 3] into its photograph."""
         image *= self._factor
-        if self._response.bend is not None:
-            self._unbent = image.copy()
-            inside = image.clip(0, 1)
-            image += np.float32(self._response.bend) * inside * (1 - inside)
 
     def backward(
         self, image: NDArray[np.float32], gradient: NDArray[np.float32]
     ) -> ResponseGradient:
         """Carries the gradient of the photograph `image` back to the render, in place.
 
-        With q = u dL/du: dL/dlog g is the sum of q over the pixels of a channel, dL/da that of s q,
-        dL/db that of s^2 q; dL/dt is the sum of c (1 - c) dL/dy. Where a mask replaced y by the
-        truth dL/dy is 0.
+        With q = y dL/dy: dL/dlog g is the sum of q over the pixels of a channel, dL/da that of s q,
+        dL/db that of s^2 q. Where a mask replaced y by the truth dL/dy is 0.
         """
-        bend = 0.0
-        if self._unbent is not None:
-            image = self._unbent
-            inside = image.clip(0, 1)
-            curve = inside * (1 - inside)
-            bend = float(np.multiply(curve, gradient).sum(dtype=np.float64))
-            gradient *= 1 + np.float32(self._response.bend or 0.0) * np.where(
-                inside == image, 1 - 2 * inside, 0)
         product = np.multiply(image, gradient)
         columns = product.sum(axis=0, dtype=np.float64)
         vignette = np.zeros(2)
@@ -174,4 +151,4 @@ class ResponsePass:
             pixels = product.reshape(*squares.shape, 3).sum(axis=2, dtype=np.float64) * squares
             vignette[:] = pixels.sum(), (pixels * squares).sum()
         gradient *= self._factor
-        return ResponseGradient(columns.reshape(-1, 3).sum(axis=0), vignette, bend)
+        return ResponseGradient(columns.reshape(-1, 3).sum(axis=0), vignette)

@@ -218,7 +218,7 @@ def _compare_steps(
     rng, shape = np.random.default_rng(2), (camera.height, camera.width)
     pixels = rng.integers(0, 256, (*shape, 3), np.uint8)
     masked = TargetImage(pixels, rng.random(shape) < 0.7, Response(
-        np.array([0.8, 1.1, 1.3], np.float32), vignette=(-0.2, -0.1), bend=0.1))
+        np.array([0.8, 1.1, 1.3], np.float32), vignette=(-0.2, -0.1)))
     scores = StepOptions(_DEGREE, _SSIM_WEIGHT, details=True, scores=True, loo=True)
     for label, target, options in (
         ("step", TargetImage(pixels), StepOptions(_DEGREE, _SSIM_WEIGHT)),

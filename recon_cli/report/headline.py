@@ -11,7 +11,7 @@ from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.records import BASE, PRUNED
 from recon_cli.report.stage_status import StageReport, StageReports
-from recon_cli.trust.quality import delivered_model, find_failed_views
+from recon_cli.trust.quality import delivered_model, find_doubtful_cameras
 from recon_cli.trust.scene_trust import TrustRecord
 from recon_cli.workspace.summaries import IngestSummary, PruneSummary, SfmSummary, TrainSummary
 
@@ -66,7 +66,7 @@ def build_headline(
     return Headline(
         _KINDS.get(kind, kind), tuple(Path(source.path).name for source in sources),
         tuple(_build_tiles(stages, metrics, trust)),
-        judge_poses(stages["sfm"], find_failed_views(metrics)), ingest.gone)
+        judge_poses(stages["sfm"], find_doubtful_cameras(metrics)), ingest.gone)
 
 
 def judge_poses(sfm: StageReport, failed: Sequence[ViewScore] = ()) -> PosesVerdict:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.faces import face_order, is_cube_face, middle_axes
-from recon_cli.scene.motion import Moment, Motion, camera_motions
 
 _REACH = 20.0  # extents; a room reaches some
 _LEAST_EXTENT = 0.05  # of the median distance of the points; a step aside in a room
@@ -50,10 +49,6 @@ class Scene:
     sparse: Path | None = None  # folder of the COLMAP model that all of it was read from
     depth: Path | None = None  # folder of ingest, where it has sensor depth
     cell: Cell | None = None  # the part that is modelled, of a block of a larger scene; None: all
-    # when the frames of videos were taken, by name; those of photos are not known
-    moments: Mapping[str, Moment] = field(default_factory=dict)
-    # log2 of the exposures of photos by EXIF, by name of the frame, where it is known
-    exposures: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def extent(self) -> float:
@@ -67,16 +62,6 @@ class Scene:
         path = 1.1 * np.linalg.norm(centers - middle, axis=1).max()
         reach = np.median(np.linalg.norm(self.points - middle, axis=1)) if len(self.points) else 0
         return float(max(path, _LEAST_EXTENT * reach))
-
-    @property
-    def motions(self) -> dict[str, Motion]:
-        """The velocities of the cameras that have a neighbour in time, by name of the view.
-
-        The faces of a panorama have none.
-        """
-        views = (*self.train, *self.validation, *self.test)
-        return camera_motions({view.name: view.camera for view in views if view.face_of is None},
-                              self.moments)
 
     @property
     def center(self) -> NDArray[np.float64]:

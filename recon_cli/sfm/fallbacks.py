@@ -143,7 +143,8 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
     """Writes the best model of all attempts that were needed into out/model.
 
     The matches of the first fallback are in the database. At `deadline`, in monotonic seconds, the
-    process is ended. SfmError if too few frames have a camera, they see the points from one place,
+    process is ended; sooner, after `spare_minutes`, a model that can be trusted is enough.
+    SfmError if too few frames have a camera, they see the points from one place,
     or the parts of the model are too weakly connected.
     """
     log = StepLog(job.attempts)
@@ -155,7 +156,9 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
         fallback = ways.pop(0)
         attempt = log.result(fallback.name, MapperAttempt)
         if attempt is None:
-            attempt, candidate = _try_fallback(job, fallback, reason, attempts, report, deadline)
+            attempt, candidate = _try_fallback(
+                job, fallback, reason, attempts, report,
+                deadline - 60 * _unneeded_minutes(job, attempts))
             if candidate is not None:
                 verdicts[fallback.name] = candidate.verdict
             log.finish(fallback.name, attempt, job.attempts / fallback.name)
@@ -170,6 +173,18 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
                 report.tell(f"trying another mapper, for about "
                             f"{format_minutes(FURTHER * attempt.seconds)} more: {reason}")
     return _publish_best(job, attempts, verdicts)
+
+
+def _unneeded_minutes(job: MappingJob, attempts: Sequence[MapperAttempt]) -> float:
+    """Returns by how much sooner than --max-minutes the search ends with what it has found.
+
+    A model that lacks many frames is worth as much time again.
+    """
+    held = max((len(attempt.registered) for attempt in attempts if attempt.trusted), default=0)
+    if job.spare_minutes is None or held < job.min_registered * len(job.names):
+        return 0.0
+    enough = held >= ENOUGH_FRAMES * len(job.names)
+    return max(0.0, job.max_minutes - job.spare_minutes * (1 if enough else 2))
 
 
 def _begin_with_fisheye(

@@ -6,6 +6,7 @@ on its standard output: a phase begins, so many of its units are done, or an err
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import threading
@@ -84,6 +85,15 @@ class MappingJob(JsonRecord):
     split: int = 0  # segments to cut the view graph into; none where 0
     part: int = 1  # of the capture, which is placed; 1 is the largest
     last: str = STEPS[-1]  # the last step to take
+    # after which a model that can be trusted is not sought to be improved; None: --max-minutes
+    spare_minutes: float | None = None
+
+    def after(self, minutes: float) -> MappingJob:
+        """Returns the job with the time that is left after so many minutes."""
+        spare = self.spare_minutes
+        return dataclasses.replace(
+            self, max_minutes=self.max_minutes - minutes,
+            spare_minutes=None if spare is None else max(0.0, spare - minutes))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -141,7 +141,7 @@ def map_segments(
     if left <= 0:
         raise SfmError(f"The segments were not mapped within {job.max_minutes:g} minutes.",
                        hint="Allow more time with --max-minutes: finished segments are kept.")
-    return SegmentRuns(dataclasses.replace(job, max_minutes=left), failed, cpu)
+    return SegmentRuns(job.after(job.max_minutes - left), failed, cpu)
 
 
 def remove_segments(job: MappingJob) -> None:
@@ -189,7 +189,7 @@ def _run_all(
             left = (deadline - time.monotonic()) / 60
             if left <= 0:
                 return "no time was left for it"
-            dataclasses.replace(job, max_minutes=left).write(file)
+            job.after(job.max_minutes - left).write(file)
             return ""
 
         command = Command((COMMAND, str(file)), job.out, job.out / OUTPUT)

@@ -76,7 +76,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         max_minutes=_time_limit(config, frames), seed=config.seed, threads=ctx.threads,
         sharpness={frame.name: frame.sharpness for frame in frames.frames
                    if frame.sharpness is not None},
-        times=_times(frames, tracks))
+        times=_times(frames, tracks),
+        spare_minutes=max(0.0, ctx.deadline.left / 60) if ctx.deadline.limited else None)
     _check_frames(job)
     for place in (scale_between or ())[:2]:  # now, not after minutes of mapping
         parse_place(str(place), job.names)
@@ -244,7 +245,7 @@ def _attempts(attempts: Sequence[AttemptSummary]) -> Iterator[str]:
         reason = attempt.reason[:1].lower() + attempt.reason[1:].rstrip(".")  # may be a sentence
         if attempt.skipped:
             yield (f"{attempt.name} was not tried (because {reason}): {attempt.skipped}, and "
-                   "--max-minutes leaves less.")
+                   "there is less time left.")
         else:
             yield (f"{attempt.name} (tried because {reason}) registered "
                    f"{format_count(attempt.registered, 'frame')}"

@@ -44,7 +44,7 @@ def choose_trainer(
 
     `looks` tells whether somebody wants to see the state after a step.
     """
-    plain = importance is None and state.photometry is None and task.schedule.config.blur != "on"
+    plain = importance is None and state.photometry is None
     if task.backend == "triton" and plain:
         return AsyncTrainer(state, task, looks).advance
     return Stepper(state, task, importance).step

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.context import TrainCallback
+from recon_cli.deadline import Clock, Deadline
 from recon_cli.scene.splats import Splats
 from recon_cli.train import densification
 from recon_cli.train.fit import fit, report_every, validation_psnr
@@ -41,9 +41,6 @@ _MOST = 100_000  # Gaussians that are timed; to make more takes as long as some 
 _GROWTH = 0.5  # of the count at once, as in `budget`
 _LENGTH = 1000  # steps of the run that stands for any other while steps are timed
 _SEGMENTS = 400  # into which a run is cut; more do not change the sum by .1%
-
-Clock = Callable[[], float]
-
 
 @dataclass(frozen=True)
 class LevelCost:
@@ -112,20 +109,19 @@ def calibrate(
     The cap of the schedule is the larger count that is timed. `scratch` is a file for a checkpoint,
     which is deleted again.
     """
-    start = clock()
+    deadline = Deadline(2 * seconds, clock)
     factors = {factor for _, factor in task.schedule.recipe.levels}
     wanted = sorted({1, *factors}, reverse=True)
     probe = _Probe(task, points, colors, clock, each=seconds / (2 * len(wanted)))
-    late = start + 2 * seconds
     levels: list[LevelCost] = []
     for level in wanted:
-        if levels and clock() >= late:
+        if levels and deadline.left <= 0:
             levels.append(_scale_cost(levels[-1], level))
         else:
             levels.append(probe.level(level))
-    report = probe.report() if clock() < late else _guess_report(levels[-1], task)
+    report = probe.report() if deadline.left > 0 else _guess_report(levels[-1], task)
     save_ms = probe.save_ms(scratch)
-    return CostModel(tuple(reversed(levels)), report, save_ms, clock() - start)
+    return CostModel(tuple(reversed(levels)), report, save_ms, deadline.spent)
 
 
 def _scale_cost(cost: LevelCost, level: int) -> LevelCost:

@@ -6,7 +6,6 @@ gains. Occlusion makes some ratios wrong, which the median over all shared point
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -74,13 +73,6 @@ _FLOOR = 0.02  # added to the spread of a pair in log units: no pair is known be
 _OWN = 1 / 3
 
 
-# EXIF: pairs that must be there to judge it; times how much nearer to the pairs than equal gains;
-# log units from which its value for one view is wrong; weight against that of a pair; the exponents
-# of the light that photographs hold (1/2.2 as sRGB, up to about 1 with a phone's curve)
-_WITNESSES, _BETTER, _DOUBT, _FAINT = 4, 0.7, 0.35, 1e-6
-_EXPONENTS, _TRIED = (0.25, 1.25), 41
-
-
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Log-gains of views as their sparse points show them."""
@@ -108,15 +100,12 @@ def estimate_gains(
     views: Sequence[TrainView],
     points: NDArray[np.float64],  # [P, 3]
     *,
-    exposures: NDArray[np.float64] | None = None,  # [F] log2 by EXIF, NaN where it is not known
     seed: int = 0,
 ) -> Estimate:
     """Returns the log-gain of each view from the colours that points have in several views.
 
     Weighted least squares over pairs: the median log-ratio of the points that two views share
     should be the difference of their log-gains. Of more than 4,000 points a seeded draw is taken.
-    EXIF decides where no pair does: for views without one, and between groups of views that share
-    nothing. It is not used where pairs of views are further from it than from being alike.
     """
     points = choose_points(points, seed)
     logs = np.stack([log_colors(view, points) for view in views])
@@ -124,8 +113,7 @@ def estimate_gains(
     known = np.unique(pairs)
     if len(known) == 0:
         return Estimate(np.zeros((len(views), 3)), 0.0, 0.0, 0)
-    nominal = None if exposures is None else _trusted(exposures, pairs, medians)
-    gains = _solve(pairs, medians, weights, len(views), nominal)
+    gains = _solve(pairs, medians, weights, len(views))
     variance = gains[known].var(axis=0).sum()
     apart = ((gains[known] - gains[_nearest(logs)[known]]) ** 2).mean(axis=0).sum()
     return Estimate(gains, float(gains[known].std(axis=0).max()),
@@ -194,16 +182,10 @@ def _nearest(logs: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def _solve(
-    pairs: NDArray[np.intp], medians: NDArray[np.float64], weights: NDArray[np.float64], views: int,
-    nominal: NDArray[np.float64] | None = None,
+    pairs: NDArray[np.intp], medians: NDArray[np.float64], weights: NDArray[np.float64], views: int
 ) -> NDArray[np.float64]:
-    """Returns the log-gains g [F, 3] that minimise sum w (g_second - g_first - median)^2.
-
-    What that leaves open is as near to `nominal` [F] as it can be, which is NaN where it says
-    nothing; without it to 0.
-    """
+    """Returns the log-gains g [F, 3] that minimise sum w (g_second - g_first - median)^2."""
     gains = np.zeros((views, 3))
-    known = None if nominal is None else np.isfinite(nominal)
     first, second = pairs.T
     for channel in range(3):
         weight, pull = weights[:, channel], weights[:, channel] * medians[:, channel]
@@ -214,38 +196,6 @@ def _solve(
         np.add.at(normal, (second, first), -weight)
         np.add.at(right, second, pull)
         np.add.at(right, first, -pull)
-        if nominal is not None and known is not None:
-            faint = _FAINT * weight.mean()
-            normal[known, known] += faint
-            right[known] += faint * nominal[known]
         # of the least norm: of mean 0 in each part that hangs together
         gains[:, channel] = np.linalg.lstsq(normal, right, rcond=1e-10)[0]
-    return gains if nominal is None else gains - gains.mean(axis=0)
-
-
-def _trusted(
-    exposures: NDArray[np.float64], pairs: NDArray[np.intp], medians: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Returns log-gains [F] by EXIF, NaN where pairs contradict it; None where it is of no use.
-
-    A photograph holds a root of the light, and a phone's tone curve is steeper or flatter than
-    that: the exponent is the one that fits the pairs best.
-    """
-    first, second = pairs.T
-    apart = math.log(2) * (exposures[second] - exposures[first])
-    ratio = np.median(medians, axis=1)
-    both = np.isfinite(apart)
-    if both.sum() < _WITNESSES or not np.abs(apart[both]).max() > 0:
-        return None
-    exponents = np.linspace(*_EXPONENTS, _TRIED)
-    misses = np.abs(ratio[both] - exponents[:, None] * apart[both])  # [E, pairs]
-    best = int(np.median(misses, axis=1).argmin())
-    if not np.median(misses[best]) < _BETTER * np.median(np.abs(ratio[both])):
-        return None
-    nominal = exponents[best] * math.log(2) * exposures
-    nominal -= np.nanmedian(nominal)
-    for view in np.flatnonzero(np.isfinite(nominal)):
-        own = (first[both] == view) | (second[both] == view)
-        if own.any() and np.median(misses[best][own]) > _DOUBT:
-            nominal[view] = np.nan
-    return np.asarray(nominal)
+    return gains

@@ -3,9 +3,9 @@
 A part has a cheap sign that must speak for it first, then two short runs at a reduced size that
 differ in this part alone are scored on views that neither trained on. A part is off unless the
 trial shows a gain; far content in rooms, and the depth of a sensor, are on unless it shows a loss.
-What was switched on is part
-of the trials that follow. `tests/bench/bench_trials.py` holds the choices
-against runs of full length.
+What was switched on is part of the trials that follow. A trial that would not end in time is left
+out or cut, and the part is as it is without evidence; those that gain most come first.
+`tests/bench/bench_trials.py` holds the choices against runs of full length.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -22,20 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.context import TrainCallback
+from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.evaluation.reference_views import mean_psnr
 from recon_cli.io.images import reduce_view
 from recon_cli.render.response import LensFalloffs
-from recon_cli.scene.motion import Motion
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.train.background import FarContent, faces, far_content, look_at_one_thing
 from recon_cli.train.exposure import Estimate, estimate_gains
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
-from recon_cli.train.motion_blur import blurred_psnr
-from recon_cli.train.moved import hide_rarer, was_moved
 from recon_cli.train.moving import SIDE
 from recon_cli.train.moving_search import (
+    FINER,
     Judge,
     Regions,
     are_enough,
@@ -43,28 +43,19 @@ from recon_cli.train.moving_search import (
     first_look,
     hide,
     is_plausible,
-    join,
     search,
     share_of,
 )
-from recon_cli.train.photometric_evidence import PhotometricEvidence, find_photometry
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.shutter import BlurEvidence, ViewMotions
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
-from recon_cli.train.trial_decisions import THRESHOLD_DB, decide, skip_trial, split
+from recon_cli.train.trial_decisions import NO_TIME, THRESHOLD_DB, decide, skip_trial, split
+from recon_cli.train.vignette_evidence import VignetteEvidence, find_vignettes
 from recon_cli.workspace.summaries import TrialDecision
 
-# Gain that blur needs: a room that gained 2.6 dB on sharp views gained 1.6 in its trial; two walks
-# gained 0 and .1, and their sharp views nothing.
-BLUR_DB = 0.5
 # Loss that speaks against depth, which was measured: with exact depth a wall lost -.04 to .13 dB by
 # the seed alone, and with depth that is wrong by a third -.06 to .19.
 DEPTH_DB = 0.2
-_BLUR_SIDE = 300  # pixels of the longer side in the trial of blur, which is gone at LEVEL
-# Times the shutter time of edges 2 pixels wide. 2.8 in a room that was blurred by a known time: its
-# edges are softer.
-SHUTTERS = 1.25, 2.5
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
 _STEPS = 400
@@ -73,12 +64,12 @@ _POINTS = 5000
 _CAP = 10_000
 _LEAST_SEARCHED = 1000  # steps of a run in which what moves is looked for
 logger = logging.getLogger("recon")
-PARTS = ("far", "stereo", "exposure", "vignette", "tone", "images", "depth", "blur")
+PARTS = ("far", "stereo", "exposure", "vignette", "images", "depth")
 
 
 def model_parts(config: RunConfig) -> dict[str, Any]:
     """Returns the parts of the model that trials decide on, by the names of their options."""
-    return {name: getattr(config, name) for name in (*PARTS, "shutter", "sh_degree")}
+    return {name: getattr(config, name) for name in (*PARTS, "sh_degree")}
 
 
 @dataclass(frozen=True)
@@ -91,9 +82,9 @@ class Needs:
     moving: Regions | None = None
 
     @property
-    def seconds(self) -> float:
-        """Spent on trials."""
-        return sum(decision.seconds for decision in self.decisions)
+    def untried(self) -> tuple[TrialDecision, ...]:
+        """The decisions for which there was no time."""
+        return tuple(one for one in self.decisions if one.reason == NO_TIME)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,15 +99,14 @@ class TrialScene:
     harmonics: bool = False  # the degree of the colours is left to a trial
     # of the training views, then of the validation views; they sort as they were taken
     names: tuple[str, ...] = ()
+    deadline: Deadline = field(default_factory=Deadline)  # of all trials
 
 
 def examine(scene: TrialScene) -> Needs:
     """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     config = scene.task.schedule.config
-    if config.densify == "reference":  # sees what tables of the literature saw
-        for part in ("vignette", "tone"):
-            if getattr(config, part) == "auto":
-                config = _with(config, part, "off")
+    if config.densify == "reference" and config.vignette == "auto":
+        config = replace(config, vignette="off")  # sees what tables of the literature saw
     if config.stereo == "auto":
         config = replace(config, stereo="on")
     bench = _Bench(scene)
@@ -147,20 +137,12 @@ def examine(scene: TrialScene) -> Needs:
     settle("exposure", "on" if drift.drifts and not drift.follows_place else None,
            f"brightness of the same points differs by {100 * drift.spread:.1f}%" + (
                ", but little between views of the same place" if drift.drifts else " only"))
-    light = bench.light(config)
-    settle("vignette", "on" if light.shades else None,
-           f"the corners of the views lack {100 * light.corner_loss:.1f}% of the light only")
-    settle("tone", "on" if light.bends_differ else None,
-           f"tone curves of the views differ by {100 * light.bend_spread:.1f}% only")
+    vignettes = bench.vignettes(config)
+    settle("vignette", "on" if vignettes.shades else None,
+           f"the corners of the views lack {100 * vignettes.corner_loss:.1f}% of the light only")
     if config.depth == "auto" and not (scene.task.has_depth or scene.task.depth_refused):
         config = replace(config, depth="off")
     settle("depth", "on" if scene.task.has_depth else None, scene.task.depth_refused)
-    if config.blur != "off":
-        blur = bench.blur
-        if config.shutter is None:
-            config = replace(config, shutter=bench.shutter(config))
-        settle("blur", "on" if blur.speaks else None,
-               "the motion of the camera does not tell which views are blurred")
     if scene.harmonics:
         config = replace(config, sh_degree=bench.degree(config, decisions))
     moving = bench.find_moving(config, decisions) if _may_mask(config) else None
@@ -189,47 +171,40 @@ def _with(config: RunConfig, part: str, value: str) -> RunConfig:
     return replace(config, **changes)
 
 
+class _Pace(TrainCallback):
+    """Cuts a short run that would not end in time."""
+
+    def __init__(self, check: Callable[[int], None]) -> None:
+        self._check = check
+
+    def on_step(self, iteration: int, splats: Splats) -> None:  # noqa: ARG002
+        """Raises OutOfTime where the rest would take too long."""
+        self._check(iteration)
+
+
 class _Bench:
     """Short runs on the views of a scene."""
 
     def __init__(self, scene: TrialScene) -> None:
         self._scene, task = scene, scene.task
+        self._deadline = scene.deadline
+        self._longest = 0.0  # seconds of a run so far
+        self._runs = 1  # that must end in time, from the one that is next
         needs_far = task.schedule.config.far != "off"
         self.far = (far_content(task.train, scene.points, task.extent) if needs_far
                     else FarContent.nothing())
         drifting = task.schedule.config.exposure != "off"
-        self.drift = (estimate_gains(task.train, scene.points, exposures=task.exposures) if drifting
+        self.drift = (estimate_gains(task.train, scene.points) if drifting
                       else Estimate(np.zeros((len(task.train), 3)), 0.0, 0.0, 0))
-        self.blur = (task.motions.find_blur(task.train)
-                     if task.motions is not None and task.schedule.config.blur != "off"
-                     else BlurEvidence.nothing())
         self._scores: dict[tuple[object, ...], list[float]] = {}
         self._states: dict[tuple[object, ...], TrainState] = {}
 
-    def light(self, config: RunConfig) -> PhotometricEvidence:
-        """Returns what the points show of vignettes and tone curves, where options ask for it."""
+    def vignettes(self, config: RunConfig) -> VignetteEvidence:
+        """Returns what the points show of vignettes, where options ask for it."""
         task = self._scene.task
-        if "auto" not in (config.vignette, config.tone):
-            return PhotometricEvidence.nothing(task.train)
-        return find_photometry(task.train, self._scene.points)
-
-    def shutter(self, config: RunConfig) -> float | None:
-        """Returns the shutter time in seconds that explains views best; None without evidence.
-
-        Without views to try it on, that of the evidence.
-        """
-        if self.blur.seconds == 0 or not (self.blur.speaks or config.blur == "on"):
-            return None
-        times = [factor * self.blur.seconds for factor in SHUTTERS]
-        if split(len(self._scene.task.train), len(self._scene.task.validation)) is None:
-            return times[0]
-        return max(times, key=lambda time: float(np.mean(self._run(
-            replace(config, blur="on", shutter=time), self._blur_level))))
-
-    @property
-    def _blur_level(self) -> int:
-        camera = self._scene.task.train[0].camera
-        return max(1, round(max(camera.width, camera.height) / _BLUR_SIDE))
+        if config.vignette != "auto":
+            return VignetteEvidence.nothing(task.train)
+        return find_vignettes(task.train, self._scene.points)
 
     def try_part(self, part: str, config: RunConfig, value: str) -> TrialDecision:
         """Returns whether a part pays on top of those that are on already."""
@@ -241,10 +216,9 @@ class _Bench:
             return skip_trial(part, "too few of the views to score see any of it")
 
         def scores(config: RunConfig) -> list[float]:
-            level = self._blur_level if part == "blur" else LEVEL
-            values = self._run(config, level)
-            if part in ("vignette", "tone"):  # brightness as filmed counts as much as all else
-                values = np.mean([values, self._run(config, level, as_is=True)], axis=0).tolist()
+            values = self._run(config)
+            if part == "vignette":  # brightness as filmed counts as much as all else
+                values = np.mean([values, self._run(config, as_is=True)], axis=0).tolist()
             return [values[i] for i in telling]
 
         # Far content gains 1 to 3 dB on four of eight captures of rooms, where few views gain much
@@ -252,9 +226,19 @@ class _Bench:
         # Depth puts surfaces where they are, which the views of the path need not show.
         lenient = part == "depth" or (
             part == "far" and not look_at_one_thing(self._scene.task.train))
-        threshold = {"blur": BLUR_DB, "depth": DEPTH_DB}.get(part, THRESHOLD_DB)
-        return decide(part, (lambda: scores(without), lambda: scores(with_it)),
-                      threshold_db=threshold, unless_worse=lenient)
+        threshold = DEPTH_DB if part == "depth" else THRESHOLD_DB
+        try:
+            self._expect_runs(_key(without), _key(with_it))
+            return decide(part, (lambda: scores(without), lambda: scores(with_it)),
+                          threshold_db=threshold, unless_worse=lenient)
+        except OutOfTime:
+            return skip_trial(part, NO_TIME, on=lenient)
+
+    def _expect_runs(self, *keys: tuple[object, ...]) -> None:
+        """Raises OutOfTime where the runs of these keys that are not made yet would end too late.
+        """
+        self._runs = len(set(keys) - self._states.keys())
+        self._deadline.refuse_late(self._runs * self._longest)
 
     def degree(self, config: RunConfig, decisions: list[TrialDecision]) -> int:
         """Returns the lowest degree of the colours that the highest does not beat by enough."""
@@ -264,44 +248,52 @@ class _Bench:
             few = replace(config, sh_degree=low)
             # A gain need not be sure: after 3,000 steps all of twelve captures gained by harmonics,
             # and two left out for want of certainty lost .6 and 1.2 dB in longer runs.
-            decisions.append(decide(
-                f"harmonics above degree {low}",
-                (partial(self._run, few), partial(self._run, config)), errors=0))
+            name = f"harmonics above degree {low}"
+            try:
+                self._expect_runs(_key(few), _key(config))
+                decisions.append(decide(
+                    name, (partial(self._run, few), partial(self._run, config)), errors=0))
+            except OutOfTime:
+                decisions.append(skip_trial(name, NO_TIME, on=True))
+                return config.sh_degree
             if not decisions[-1].on:
                 return low
         return config.sh_degree
 
     def find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
         """Returns where each training and validation view shows what moves; None: no masks pay."""
+        if config.moving == "on":  # asked for, whatever it takes
+            self._deadline = Deadline()
+        try:
+            return self._find_moving(config, decisions)
+        except OutOfTime:
+            decisions.append(skip_trial("moving", NO_TIME))
+            return None
+
+    def _find_moving(self, config: RunConfig, decisions: list[TrialDecision]) -> Regions | None:
         start, task = time.perf_counter(), self._scene.task
-        # That a view is blurred alike is no contradiction. Its render is compared as it is, so
-        # corners are as dark in the model as in the photos.
-        config = replace(config, blur="off", vignette="off")
+        # renders are compared as they are: corners are to be as dark in the model as in the photos
+        config = replace(config, vignette="off")
         if split(len(task.train), len(task.validation)) is None:
             decisions.append(skip_trial("moving", "there are too few views to tell"))
             return None
         views, judge = [*task.train, *task.validation], Judge(config.sh_degree, task.backend)
+        self._expect_runs(_key(config, self._moving_level))
         model = self.model(config, self._moving_level)
         order = np.argsort(self._scene.names) if self._scene.names else np.arange(len(views))
         rows = order[first_look(len(views))]
-        looked = judge.compare(model, [views[row] for row in rows])
-        moved = self._find_moved(model, views, judge, order) if was_moved(looked) else None
-        signs = find_signs(looked)
-        if config.moving == "on" or are_enough(signs):
-            if moved is not None:  # a model without its ghost
-                views = hide(views, moved)
-                model = self._probe(config, [view for view in views[:len(task.train)]
-                                             if leaves_enough(view.mask)], SIDE)
-            regions = search(
-                model, views, range(len(task.train)), judge, partial(self._probe, config))
-            regions = regions if moved is None else join(moved, regions)
-        elif moved is not None:
-            regions = moved
-        else:
+        begun = self._deadline.spent
+        signs = find_signs(judge.compare(model, [views[row] for row in rows]))
+        each = (self._deadline.spent - begun) / len(rows)  # seconds of a view
+        if config.moving != "on" and not are_enough(signs):
             decisions.append(replace(skip_trial(
                 "moving", f"{signs.sum()} of {len(signs)} views contradict the others"),
                 seconds=time.perf_counter() - start))
             return None
+        # the looks of the search are two like the first and a larger one, and it makes two models
+        self._deadline.refuse_late(
+            (2 + FINER**2) * each * len(views) + (1 + FINER) * self._longest)
+        regions = search(model, views, range(len(task.train)), judge, partial(self._probe, config))
         if not any(region.any() for region in regions):
             decision = skip_trial("moving", "what contradicted other views was not found again")
         elif not is_plausible(regions):
@@ -314,18 +306,6 @@ class _Bench:
                 config, self.model(config, self._moving_level), hide(views, regions))
         decisions.append(replace(decision, seconds=time.perf_counter() - start))
         return regions if decision.on else None
-
-    @staticmethod
-    def _find_moved(
-        model: Splats, views: Sequence[TrainView], judge: Judge, order: NDArray[np.int64]
-    ) -> Regions:
-        """Returns where each view shows what was moved half-way in the rarer of its states."""
-        hidden = hide_rarer(judge.compare(model, [views[row] for row in order]))
-        regions = [hidden[place] for place in np.argsort(order)]
-        logger.info("moving: something was moved half-way; %.1f%% of the pixels of %d of %d views "
-                    "show where it was seen less", 100 * share_of(regions),
-                    sum(region.any() for region in regions), len(views))
-        return regions
 
     @property
     def _moving_level(self) -> int:
@@ -393,7 +373,7 @@ class _Bench:
         if (scored := (as_is, *key)) not in self._scores:
             state = self._states[key]
             self._scores[scored] = self._score(
-                state.splats, self._views()[1], short, level, self._held_out_motions(short),
+                state.splats, self._views()[1], short, level,
                 None if state.photometry is None else state.photometry.falloffs, as_is=as_is)
         return self._scores[scored]
 
@@ -415,29 +395,20 @@ class _Bench:
             train = [replace(twin, depth=view.depth)
                      for twin, view in zip(scene.twins()[0], train, strict=True)]
         rows, _ = self._views()
-        motions = scene.task.motions and scene.task.motions.select(rows)
-        exposures = None if scene.task.exposures is None else scene.task.exposures[list(rows)]
-        return self._fit(config, [train[i] for i in rows], factor=level, motions=motions,
-                         exposures=exposures)
+        return self._fit(config, [train[i] for i in rows], factor=level)
 
     def _score(
         self, splats: Splats, views: Sequence[TrainView], config: RunConfig, level: int = LEVEL,
-        motions: Sequence[Motion | None] = (), falloffs: LensFalloffs | None = None,
-        *, as_is: bool = False,
+        falloffs: LensFalloffs | None = None, *, as_is: bool = False,
     ) -> list[float]:
-        """Returns the corrected PSNR in dB of each view, blurred by its motion where it has one."""
-        task, degree = self._scene.task, config.sh_degree
-        small = [reduce_view(view, level) for view in views]
+        """Returns the PSNR in dB of each view, after the best gain of each channel or as it is."""
         return [
-            mean_psnr(
-                splats, [view], degree, task.backend, corrected=not as_is, falloffs=falloffs)
-            if motion is None
-            else blurred_psnr(splats, view, motion, replace(task, schedule=Schedule(config)))
-            for view, motion in zip(small, motions or [None] * len(small), strict=True)]
+            mean_psnr(splats, [reduce_view(view, level)], config.sh_degree,
+                      self._scene.task.backend, corrected=not as_is, falloffs=falloffs)
+            for view in views]
 
     def _fit(
-        self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL,
-        motions: ViewMotions | None = None, exposures: NDArray[np.float64] | None = None,
+        self, config: RunConfig, views: Sequence[TrainView], *, factor: float = LEVEL
     ) -> TrainState:
         """Returns the end of a short run on views reduced by a factor."""
         scene, task = self._scene, self._scene.task
@@ -447,23 +418,18 @@ class _Bench:
         recipe = dataclasses.replace(recipe, levels=(), replaced_at_once=0.0,
                                      means_rate=_FURTHER * recipe.means_rate)
         schedule = Schedule(config, recipe)
+        limited, begun = self._deadline.limited, self._deadline.spent
+        # the search for surfaces has a time of its own
+        stereo = None if limited else task.stereo
         small = Task([reduce_view(view, factor) for view in views], [], schedule, task.extent,
-                     task.backend, task.device, nearness=task.nearness, stereo=task.stereo,
-                     motions=motions, exposures=exposures)
+                     task.backend, task.device, nearness=task.nearness, stereo=stereo)
         # reduced views would be reduced once more in the search for places far outside
         state = first_state(small, scene.points, scene.colors, most=_POINTS, far=self.far)
-        fit(state, small, config.iterations)
+        pace = self._deadline.keep_pace(config.iterations * max(1, self._runs))
+        fit(state, small, config.iterations, (_Pace(pace),) if limited else ())
+        self._longest = max(self._longest, self._deadline.spent - begun)
+        self._runs -= 1
         return state
-
-    def _held_out_motions(self, config: RunConfig) -> Sequence[Motion | None]:
-        """Returns the motions of the views to score; None for those that are scored as sharp."""
-        task = self._scene.task
-        chosen = split(len(task.train), len(task.validation))
-        assert chosen is not None
-        if config.blur != "on" or task.motions is None:
-            return [None] * len(chosen.held_out)
-        motions = task.motions.train if chosen.own else task.motions.validation
-        return [motions[i] for i in chosen.held_out]
 
 
 def short_model(scene: TrialScene, level: int = LEVEL) -> Splats:

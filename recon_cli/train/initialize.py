@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from recon_cli.config.stages import RunConfig
+from recon_cli.deadline import Deadline
 from recon_cli.errors import TrainingError, format_count
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.background import FarContent, far_content, splats_of
 from recon_cli.train.exposure import Exposure, estimate_gains
-from recon_cli.train.photometric_evidence import find_photometry
-from recon_cli.train.photometry import Curves, Photometry, Vignettes
+from recon_cli.train.photometry import Photometry, Vignettes
 from recon_cli.train.state import TrainState, load_state, new_state
 from recon_cli.train.stereo_points import SurfacePoints
 from recon_cli.train.task import Task
+from recon_cli.train.vignette_evidence import find_vignettes
 
 _OPACITY = 0.1  # initial opacity of the reference implementation
 _NEIGHBOURS = 3
@@ -102,16 +103,17 @@ def first_state(
         backend=task.backend, photometry=photometry)
 
 
-def surfaces_of(task: Task, sparse: int) -> SurfacePoints:
+def surfaces_of(task: Task, sparse: int, deadline: Deadline | None = None) -> SurfacePoints:
     """Returns the points by stereo that a run begins with, besides those of structure from motion.
 
     They fill what `sparse` points leave of half of the cap: the rest goes where the error is.
+    OutOfTime where a search for them would not end by the deadline.
     """
     config = task.schedule.config
     room = config.max_gaussians // 2 - sparse
     if config.stereo != "on" or task.stereo is None or room <= 0:
         return SurfacePoints.nothing()
-    return task.stereo.found.at_most(room, config.seed)
+    return task.stereo.search(deadline).at_most(room, config.seed)
 
 
 def restore_state(path: Path, task: Task) -> TrainState:
@@ -148,18 +150,16 @@ def new_photometry(
 ) -> Photometry | None:
     """Returns the photometry of the training images before any step; None unless any is fitted.
 
-    It starts with what `points` [P, 3] show; without them with no gain, curve or vignette.
+    It starts with what `points` [P, 3] show; without them with no gain or vignette.
     """
     config, views = task.schedule.config, task.train
-    gains = bends = exponents = None
+    gains = exponents = None
     if points is not None and config.exposure == "on":
-        gains = estimate_gains(views, points, exposures=task.exposures).log_gains
-    if points is not None and "on" in (config.tone, config.vignette):
-        evidence = find_photometry(views, points)
-        bends, exponents = evidence.bends, evidence.vignettes
+        gains = estimate_gains(views, points).log_gains
+    if points is not None and config.vignette == "on":
+        exponents = find_vignettes(views, points).exponents
     return Photometry.from_parts(
         Exposure(len(views), start=gains) if config.exposure == "on" else None,
-        Curves(len(views), start=bends) if config.tone == "on" else None,
         Vignettes([view.camera for view in views], start=exponents)
         if config.vignette == "on" else None)
 

@@ -149,7 +149,7 @@ def _run_config(
     denoised = all(each.images == "denoised" for each in configs)
     fitted: dict[str, Any] = {
         part: "on" if steps > 0 and any(getattr(each, part) == "on" for each in configs)
-              else "off" for part in ("exposure", "vignette", "tone")}
+              else "off" for part in ("exposure", "vignette")}
     return dataclasses.replace(
         configs[0], iterations=max(1, steps), max_size=max(each.max_size for each in configs),
         sh_degree=degree, max_gaussians=max(MIN_GAUSSIANS, count), far="off", stereo="off",

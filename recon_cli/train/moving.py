@@ -80,21 +80,11 @@ def find_others(
     if not len(pixels):
         return np.empty(0, np.int64)
     where = places(own.camera, own.depth, pixels)
-    shares = np.array([0.0 if other is own else float(np.mean(_sees(other, where)))
+    shares = np.array([0.0 if other is own else float(np.mean(sees(other, where)))
                        for other in views])
     good = np.flatnonzero(shares >= _SHARED)
     spread = np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))
     return np.asarray(good[spread], np.int64)
-
-
-def count_witnesses(own: ComparedView, views: Sequence[ComparedView]) -> NDArray[np.int64]:
-    """Returns how many of `views` see the surface in each pixel [H, W] of another view."""
-    pixels = np.flatnonzero(own.depth.reshape(-1) > 0)
-    where = places(own.camera, own.depth, pixels)
-    count = np.zeros(own.depth.size, np.int64)
-    for other in views:
-        count[pixels] += _sees(other, where)
-    return count.reshape(own.depth.shape)
 
 
 def _grid(depth: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -104,7 +94,7 @@ def _grid(depth: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.asarray(pixels[depth.reshape(-1)[pixels] > 0], np.int64)
 
 
-def project(
+def _project(
     camera: Camera, where: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Returns column and line, from the centre of the first pixel, and depth of places [N, 3]."""
@@ -115,9 +105,9 @@ def project(
             np.asarray(z, np.float32))
 
 
-def _sees(view: ComparedView, where: NDArray[np.float64]) -> NDArray[np.bool_]:
+def sees(view: ComparedView, where: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Returns which places [N, 3] are on the surface that a view sees, and count there."""
-    column, line, depth = project(view.camera, where)
+    column, line, depth = _project(view.camera, where)
     u, v = (np.rint(np.clip(item, -2, 1 << 20)).astype(np.int64) for item in (column, line))
     inside = (depth > 0) & (u >= 0) & (v >= 0) & (
         u < view.camera.width) & (v < view.camera.height)
@@ -154,8 +144,8 @@ def contradict(
     errors = np.full((len(others), len(pixels), 3), np.inf, np.float32)
     for row, index in zip(errors, others, strict=True):
         other = views[index]
-        visible = _sees(other, where)
-        column, line, _ = project(other.camera, where[visible])
+        visible = sees(other, where)
+        column, line, _ = _project(other.camera, where[visible])
         row[visible] = _sample(other.error, column, line)
     count = np.isfinite(errors[..., 0]).sum(axis=0)
     told = count >= _LEAST
@@ -206,13 +196,13 @@ _MARGIN = 2  # pixels that a region is widened by
 SURE, _SPREAD_FLOOR = 12.0, 0.001
 # A tenth of it must stand out clearly: shadows of whoever films stay below .21 (fox), people had
 # more than .3. And half of it must be seen by so many others.
-CLEAR, _WITNESSES = 0.22, 4
+_CLEAR, _WITNESSES = 0.22, 4
 _REACH = 0.12  # of the longer side: a faint part is no farther from a strong one
-_ALONE = 0.8  # of CLEAR: what a view errs by where it contradicts others
+_ALONE = 0.8  # of _CLEAR: what a view errs by where it contradicts others
 # Share of the views of a surface that may show something else there. Where more do, as at a window
 # or a mirror, it is the model that is wrong.
 _FEW = 0.5
-TOO_NOISY = 0.03  # noise from which a model is too poor to tell: two walks of three such had errors
+_TOO_NOISY = 0.03  # noise of a model that is too poor to tell: two walks of three such had errors
 
 
 def noise_level(views: Sequence[ComparedView]) -> float:
@@ -225,9 +215,7 @@ def _length(error: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.square(error).mean(axis=-1)), np.float32)
 
 
-def find_suspects(
-    view: ComparedView, noise: float, clear: float = CLEAR
-) -> NDArray[np.bool_]:
+def find_suspects(view: ComparedView, noise: float) -> NDArray[np.bool_]:
     """Returns where a view differs enough from its render to be compared with others, [H, W].
 
     What moves errs by itself about as much as it contradicts others, so that most regions of most
@@ -238,7 +226,7 @@ def find_suspects(
     result = np.zeros(weak.shape, np.bool_)
     for region in _components(weak):
         if _is_large(region, strong) and np.quantile(
-                error[region & (error >= _TELLS)], 0.9) >= _ALONE * clear:
+                error[region & (error >= _TELLS)], 0.9) >= _ALONE * _CLEAR:
             result |= region
     return np.asarray(cv2.dilate(result.astype(np.uint8), _disc(_MARGIN)) > 0)
 
@@ -267,7 +255,7 @@ def _is_large(region: NDArray[np.bool_], strong: NDArray[np.bool_]) -> bool:
 
 
 def find_regions(
-    found: Contradiction, noise: float, agreed: float = SURE, clear: float = CLEAR
+    found: Contradiction, noise: float, agreed: float = SURE
 ) -> NDArray[np.bool_]:
     """Returns where a view shows what moves, [H, W]: connected, large and contradicted."""
     strong, weak = _thresholds(found.amount - _BEYOND * found.spread, noise)
@@ -278,7 +266,7 @@ def find_regions(
         told = region & (found.seen >= _LEAST) & (found.amount >= _TELLS)
         if (_is_large(told, strong)
                 and np.median(ratio[told]) >= agreed
-                and np.quantile(found.amount[told], 0.9) >= clear
+                and np.quantile(found.amount[told], 0.9) >= _CLEAR
                 and np.median(found.seen[told]) >= _WITNESSES):
             reach = round(_REACH * max(region.shape))
             result |= region & (cv2.dilate((told & strong).astype(np.uint8), _disc(reach)) > 0)
@@ -312,8 +300,8 @@ def _common(
     seen = inside = 0
     for index in others:
         other = views[index]
-        visible = where[_sees(other, where)]
-        column, line, _ = project(other.camera, visible)
+        visible = where[sees(other, where)]
+        column, line, _ = _project(other.camera, visible)
         seen += len(visible)
         inside += int(regions[index][np.rint(line).astype(int), np.rint(column).astype(int)].sum())
     return inside / max(1, seen)
@@ -340,7 +328,7 @@ def find_moving(
     others = views if witnesses is None else witnesses
     regions = [np.zeros(view.depth.shape, np.bool_) for view in views]
     noise = noise_level(others)
-    if noise > TOO_NOISY:
+    if noise > _TOO_NOISY:
         return regions
     suspects = {row: where for row, view in enumerate(views)
                 if (where := find_suspects(view, noise)).any()}

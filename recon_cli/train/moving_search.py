@@ -114,12 +114,6 @@ def find_in_held_out(
             for region, view in zip(find_moving(compared, witnesses), held_out, strict=True)]
 
 
-def join(first: Regions, second: Regions) -> Regions:
-    """Returns the regions of each view in either, at the size in `second`."""
-    return [enlarge(one, other.shape[1], other.shape[0]) | other
-            for one, other in zip(first, second, strict=True)]
-
-
 def share_of(regions: Sequence[NDArray[np.bool_]]) -> float:
     """Returns the mean share of the pixels of a view."""
     return float(np.mean([region.mean() for region in regions])) if regions else 0.0

@@ -1,7 +1,7 @@
-"""What the training images add to the light of the scene: gains, vignettes and tone curves.
+"""What the training images add to the light of the scene: gains and vignettes.
 
-The scene keeps its own brightness: log-gains and bends have a mean of 0 over the images, and a
-vignette takes nothing away at the principal point. None of it is part of the .ply.
+The scene keeps its own brightness: log-gains have a mean of 0 over the images, and a vignette takes
+nothing away at the principal point. None of it is part of the .ply.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ from recon_cli.train.optimizer import SparseAdam
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import PhotometrySummary, VignetteSummary
 
-# Of bends and of the exponents of vignettes; both fall to a tenth as those of exposures do.
-_BEND_RATE, _VIGNETTE_RATE, _FALL = 0.003, 0.002, 0.1
-_MOST_BEND = 0.5  # of 1, at which a curve is flat at one end
+_RATE, _FALL = 0.002, 0.1  # of the exponents; it falls to a tenth, as that of exposures does
 _DARKEST = 1.5  # of -(a + b): a corner with a fifth of the light, as of a fast lens wide open
 _ONES = np.ones(3, np.float32)
 
@@ -51,26 +49,21 @@ def read_falloffs(folder: Path) -> LensFalloffs | None:
 class Photometry:
     """The parts that are fitted with the Gaussians, each None where it is off."""
 
-    def __init__(
-        self, exposure: Exposure | None, curves: Curves | None, vignettes: Vignettes | None
-    ) -> None:
-        self.exposure, self.curves, self.vignettes = exposure, curves, vignettes
+    def __init__(self, exposure: Exposure | None, vignettes: Vignettes | None) -> None:
+        self.exposure, self.vignettes = exposure, vignettes
 
     @staticmethod
-    def from_parts(
-        exposure: Exposure | None, curves: Curves | None, vignettes: Vignettes | None
-    ) -> Photometry | None:
+    def from_parts(exposure: Exposure | None, vignettes: Vignettes | None) -> Photometry | None:
         """Returns the photometry of some parts, None where all are off."""
-        if exposure is None and curves is None and vignettes is None:
+        if exposure is None and vignettes is None:
             return None
-        return Photometry(exposure, curves, vignettes)
+        return Photometry(exposure, vignettes)
 
     def response(self, image: int) -> Response:
         """Returns the response of a training image."""
         return Response(
             _ONES if self.exposure is None else self.exposure.gain(image),
-            None if self.vignettes is None else self.vignettes.of_image(image),
-            None if self.curves is None else self.curves.bend(image))
+            None if self.vignettes is None else self.vignettes.of_image(image))
 
     @property
     def falloffs(self) -> LensFalloffs | None:
@@ -84,8 +77,6 @@ class Photometry:
         """
         if self.exposure is not None:
             self.exposure.step(image, gradient.log_gain, done)
-        if self.curves is not None:
-            self.curves.step(image, gradient.bend, done)
         if self.vignettes is not None:
             self.vignettes.step(image, gradient.vignette, done)
 
@@ -95,7 +86,6 @@ class Photometry:
         return PhotometrySummary(
             gain_spread=None if self.exposure is None else round(
                 float(self.exposure.log_gains.std(axis=0).max()), 4),
-            bend_spread=None if self.curves is None else round(float(self.curves.bends.std()), 4),
             vignettes=tuple(
                 VignetteSummary(lens=key, a=a, b=b, corner=round(math.exp(a + b), 4))
                 for key, (a, b) in falloffs.items()))
@@ -110,40 +100,8 @@ class Photometry:
             part.restore(tensors)
 
     @property
-    def _parts(self) -> list[Exposure | Curves | Vignettes]:
-        parts = self.exposure, self.curves, self.vignettes
-        return [part for part in parts if part is not None]
-
-
-class Curves:
-    """The bends of the tone curves of all training images; `start` [F] gets a mean of 0."""
-
-    def __init__(self, images: int, *, start: NDArray[np.float64] | None = None) -> None:
-        first = np.zeros(images) if start is None else start - start.mean()
-        self._rows = SparseAdam(torch.from_numpy(first)[:, None])
-
-    @property
-    def bends(self) -> NDArray[np.float64]:
-        """t of all images, [F]; a copy."""
-        return self._rows.value[:, 0].numpy().copy()
-
-    def bend(self, image: int) -> float:
-        """Returns t of an image."""
-        return float(self._rows.value[image, 0])
-
-    def step(self, image: int, gradient: float, done: float) -> None:
-        """Moves one image's bend against its gradient."""
-        self._rows.step(image, np.array([gradient]), _BEND_RATE * _FALL**done)
-        self._rows.center()
-        self._rows.value.clamp_(-_MOST_BEND, _MOST_BEND)
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Returns bends, moments and counts by name, for a checkpoint."""
-        return self._rows.tensors("curve")
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Restores the state that `tensors` returned."""
-        self._rows.restore("curve", tensors)
+    def _parts(self) -> list[Exposure | Vignettes]:
+        return [part for part in (self.exposure, self.vignettes) if part is not None]
 
 
 class Vignettes:
@@ -177,7 +135,7 @@ class Vignettes:
     def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
         """Moves the vignette of one image's camera against its gradient [2]."""
         row = self._groups[image]
-        self._rows.step(row, gradient, _VIGNETTE_RATE * _FALL**done)
+        self._rows.step(row, gradient, _RATE * _FALL**done)
         self._rows.value[row] = torch.tensor(
             falling(*self._rows.value[row].tolist()), dtype=torch.float64)
 

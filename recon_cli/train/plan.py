@@ -10,7 +10,6 @@ import dataclasses
 import filecmp
 import logging
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 from recon_cli.config.protocols import follow
 from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig, TrainConfig
 from recon_cli.context import StageContext
+from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate
@@ -42,7 +42,11 @@ from recon_cli.train.train_data import (
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import TrainPlan
 
+# Shares of --minutes: of trials and the search for surfaces together at most, of the trials alone
+# at most (surfaces gain in every room, trials in some), and of the steps at least.
+EXTRAS_SHARE, TRIALS_SHARE, STEPS_SHARE = 0.2, 0.1, 0.5
 CALIBRATION_SHARE = 0.05  # of the minutes, at most
+LEAST_STEPS = 0.15  # of the quality's steps, below which a scene is blurred: the user is told
 CALIBRATION_SECONDS = 0.5  # where no time is given: a twentieth of a draft
 
 _SMALLEST_RUN = 100  # steps; fewer show nothing of a room
@@ -107,12 +111,12 @@ def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
 
 
 def make_plan(
-    asked: TrainConfig, facts: Facts, cost: CostModel, *, spent: float = 0.0,
+    asked: TrainConfig, facts: Facts, cost: CostModel, *, left: float | None = None,
     model: FinishedModel | None = None,
 ) -> TrainPlan:
-    """Returns the plan; --minutes include the calibration and the seconds `spent` on trials.
+    """Returns the plan, whose steps take the seconds that are `left` where minutes are asked for.
 
-    `model` is the one that the run continues.
+    None: all of them but those of the calibration. `model` is the one that the run continues.
     """
     continues_at = None if model is None else model.steps
 
@@ -131,7 +135,7 @@ def make_plan(
 
     if asked.minutes is None:
         return at(first_config(asked).iterations)
-    left = 60 * asked.minutes - cost.seconds - spent
+    left = 60 * asked.minutes - cost.seconds if left is None else left
     return at(_largest(lambda steps: at(steps).seconds <= left, _SMALLEST_RUN, _LONGEST_RUN))
 
 
@@ -231,7 +235,8 @@ def plan_task(
 
     `model` is the one that the run continues, with its parts; `edited` are a user's masks.
     """
-    given, edited = scene, edited or EditedMasks()
+    seconds = math.inf if config.minutes is None else 60 * config.minutes
+    given, edited, deadline = scene, edited or EditedMasks(), Deadline(seconds)
     planned = (out / TrainPlan.FILE).exists()
     if not planned and model is not None:
         copy_masks(model.folder, out)
@@ -250,8 +255,9 @@ def plan_task(
             first, max_gaussians=max(first.max_gaussians, model.gaussians))
     fit_memory = gaussians_that_fit(scene, first, ctx)
     task = load_task(scene, first, ctx)
+    extras = deadline.part(EXTRAS_SHARE)
     needs = Needs(first, model.decisions) if model is not None else choose_parts(
-        task, scene, ctx, harmonics=config.sh_degree is None)
+        task, scene, ctx, harmonics=config.sh_degree is None, deadline=deadline.part(TRIALS_SHARE))
     if needs.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     detail = count_detail(task.train)  # behind what moves there is as much as beside it
@@ -261,13 +267,15 @@ def plan_task(
         task = load_task(scene, dataclasses.replace(first, images=needs.config.images), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = gather_facts(task, scene, fit_memory, detail)
-    spent = 0.0 if model is not None else needs.seconds + _search_surfaces(
-        probe_config(asked, facts), facts, task)
-    cost = _measure_cost(asked, facts, task, scene, out)
-    plan = make_plan(asked, facts, cost, spent=spent, model=model)
-    if model is None and asked.minutes is not None:  # longer than the likely run, with more room
-        spent += _search_surfaces(run_config(asked, plan), facts, task)
-        plan = make_plan(asked, facts, cost, spent=spent)
+    if config.stereo == "on":  # asked for, whatever it takes
+        extras = Deadline()
+    timed = _plan_in_time(asked, facts, task, scene, out, deadline, extras, model)
+    given_up = [f"{one.name} is {'on' if one.on else 'off'}" for one in needs.untried]
+    given_up += ["stereo is off"] if timed[0].stereo != asked.stereo else []
+    asked, plan = timed
+    if given_up:
+        ctx.notice(f"{seconds:.0f} s of training leave no time to try all parts of the model: "
+                   f"{', '.join(given_up)}.")
     _report_plan(plan, asked, facts, ctx)
     config = run_config(asked, plan)
     write_config(out, config)
@@ -275,8 +283,37 @@ def plan_task(
     return dataclasses.replace(task, schedule=make_schedule(config, plan.continues_at))
 
 
-def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False) -> Needs:
-    """Returns which parts of the model the scene needs, and logs the reasons."""
+def _plan_in_time(
+    asked: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path, deadline: Deadline,
+    extras: Deadline, model: FinishedModel | None,
+) -> tuple[TrainConfig, TrainPlan]:
+    """Returns the options, and the plan by timed steps that ends by the deadline.
+
+    Surfaces are left out whose search would not end by that of the `extras`.
+    """
+    def search(asked: TrainConfig, likely: RunConfig) -> TrainConfig:
+        found = model is not None or _search_surfaces(likely, facts, task, extras)
+        return asked if found else dataclasses.replace(asked, stereo="off")
+
+    def plan() -> TrainPlan:
+        left = max(deadline.left, STEPS_SHARE * deadline.seconds)
+        return make_plan(asked, facts, cost, left=left, model=model)
+
+    asked = search(asked, probe_config(asked, facts))
+    cost = _measure_cost(asked, facts, task, scene, out)
+    if deadline.limited:  # longer than the likely run, with more room
+        asked = search(asked, run_config(asked, plan()))
+    return asked, plan()
+
+
+def choose_parts(
+    task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool = False,
+    deadline: Deadline | None = None,
+) -> Needs:
+    """Returns which parts of the model the scene needs, and logs the reasons.
+
+    Trials that would not end by the deadline are left out.
+    """
     config = task.schedule.config
 
     def twins() -> tuple[list[TrainView], list[TrainView]]:
@@ -289,19 +326,23 @@ def choose_parts(task: Task, scene: Scene, ctx: StageContext, *, harmonics: bool
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)
     needs = examine(TrialScene(
         task, scene.points, scene.colors, twins if changed else None, harmonics,
-        tuple(view.name for view in (*scene.train, *scene.validation))))
+        tuple(view.name for view in (*scene.train, *scene.validation)), deadline or Deadline()))
     for decision in needs.decisions:
         logger.info("%s: %s, %s", decision.name, "on" if decision.on else "off", decision.reason)
     return needs
 
 
-def _search_surfaces(config: RunConfig, facts: Facts, task: Task) -> float:
-    """Searches the surfaces that a run begins with, once at most; returns the seconds."""
-    start = time.perf_counter()
-    found = surfaces_of(dataclasses.replace(task, schedule=Schedule(config)), facts.points)
+def _search_surfaces(config: RunConfig, facts: Facts, task: Task, deadline: Deadline) -> bool:
+    """Searches the surfaces that a run begins with, once at most; returns whether there was time.
+    """
+    try:
+        found = surfaces_of(
+            dataclasses.replace(task, schedule=Schedule(config)), facts.points, deadline)
+    except OutOfTime:
+        return False
     logger.info("%s points on surfaces besides %s of sfm", f"{len(found.points):,}",
                 f"{facts.points:,}")
-    return time.perf_counter() - start
+    return True
 
 
 def _measure_cost(
@@ -326,9 +367,12 @@ def _report_plan(plan: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageC
     if config.max_gaussians is None and plan.max_gaussians < useful:
         ctx.notice(f"memory has room for {plan.max_gaussians:,} Gaussians; {useful:,} would suit "
                    "the images")
-    if config.minutes is not None and plan.seconds > 60 * config.minutes:
-        ctx.notice(f"{config.minutes:g} minutes are too short: the smallest run of "
-                   f"{plan.iterations} steps takes about {plan.seconds:.1f} s")
+    steps, usual = plan.iterations - (plan.continues_at or 0), QUALITIES[config.quality].iterations
+    if config.minutes is not None and steps < LEAST_STEPS * usual:
+        ctx.notice(f"{60 * config.minutes:.0f} s of training are too short: {steps:,} steps take "
+                   f"{plan.seconds:.0f} s, and a {config.quality} run has {usual:,}. The scene "
+                   f"will be blurred; about {plan.seconds * usual / steps / 60:.1f} minutes of "
+                   "training would not leave it so.")
 
 
 def first_or_saved(

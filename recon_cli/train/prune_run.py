@@ -113,7 +113,7 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     start, epoch = begin(), task.schedule.epoch(len(task.train))
     steps = config.recovery
     if steps is None:
-        steps = max(train_config.iterations // _END_RECOVERY, _END_EPOCHS * epoch)
+        steps = count_recovery_steps(train_config.iterations, epoch)
         if config.at == "mid":
             # as many as the unpruned run took, which may have stopped early; where it continued for
             # a few steps only, too few to recover
@@ -122,6 +122,11 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
         config.rounds or rounds_within(steps, epoch), seconds_at(train / LOG, start.iteration))
+
+
+def count_recovery_steps(iterations: int, epoch: int) -> int:
+    """Returns the steps after which a finished model has recovered; `epoch` in steps."""
+    return max(iterations // _END_RECOVERY, _END_EPOCHS * epoch)
 
 
 def _was_continued(train: Path) -> bool:

@@ -72,7 +72,6 @@ class Recipe:
     means_final: float = 0.01  # last rate of the means over the first; exponential between
     final_from: float = 1.0  # share from which all other rates fall
     final_rate: float = 1.0  # to which they fall at the end, of their own; exponential
-    blur_from: float = 0.6  # share from which blurred views are compared with blurred renders
     backdrop: float = 0.0  # grey level behind all Gaussians, 0 to 1
 
 
@@ -181,10 +180,6 @@ class Schedule:
         """Tells whether the higher degrees are moved in this step."""
         return self.sh_degree(iteration) > 0 and iteration % self.recipe.sh_every == 0
 
-    def blurs(self, iteration: int) -> bool:
-        """Tells whether blurred views are compared with blurred renders in this step."""
-        return self.config.blur == "on" and self.share(iteration - 1) >= self.recipe.blur_from
-
     def densifies(self, iteration: int) -> bool:
         """Tells whether Gaussians are added and deleted after this step."""
         start = max(self.config.densify_every,
@@ -237,10 +232,6 @@ class ContinuedSchedule(Schedule):
     def means_rate(self, iteration: int) -> float:
         """Returns the learning rate of the means in units of `Task.means_unit`."""
         return self.recipe.means_restart_rate * super().means_rate(iteration)
-
-    def blurs(self, iteration: int) -> bool:  # noqa: ARG002
-        """Tells whether blurred views are compared with blurred renders: from the first step."""
-        return self.config.blur == "on"
 
     def sh_degree(self, iteration: int) -> int:  # noqa: ARG002
         """Returns the degree in use, which is the highest."""

@@ -16,7 +16,6 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train.densification import STRATEGIES
 from recon_cli.train.gradient import gradient_step
 from recon_cli.train.importance import Importance
-from recon_cli.train.motion_blur import BlurredSteps
 from recon_cli.train.state import DensificationStats, TrainState
 from recon_cli.train.task import Task
 
@@ -44,7 +43,6 @@ class Stepper:
     def __init__(self, state: TrainState, task: Task, importance: Importance | None) -> None:
         self._state, self._task, self._importance = state, task, importance
         self._compute = gradient_step(task.backend, task.device)
-        self._blurred = BlurredSteps(task, self._compute)
         self._strategy = STRATEGIES[task.schedule.config.densify]
 
     def step(self) -> float:
@@ -55,8 +53,7 @@ class Stepper:
         """
         state, task = self._state, self._task
         iteration = state.iteration + 1
-        batch = [next_view(state, task, self._blurred)
-                 for _ in range(task.schedule.config.batch_views)]
+        batch = [next_view(state, task) for _ in range(task.schedule.config.batch_views)]
         result = self._gather(batch, iteration)
         state.iteration = iteration
         loss = float(result.loss.mean())
@@ -109,15 +106,14 @@ class Stepper:
             loo=importance is not None and importance.leaves_out,
             harmonics=schedule.moves_sh(iteration), depth_weight=schedule.depth_weight(iteration))
         response = None if state.photometry is None else state.photometry.response(index)
-        compute = self._blurred.choose(view, index, iteration) or self._compute
-        result.loss[place], statistics = compute(state.optimizer, view, options, response)
+        result.loss[place], statistics = self._compute(state.optimizer, view, options, response)
         if statistics is None or not np.isfinite(result.loss[place]):
             return None
         result.visible[place] = 1
         if importance is not None:
             importance.add(statistics)
         if response is not None:
-            result.response[place] = compute.response_gradient
+            result.response[place] = self._compute.response_gradient
         return statistics
 
     def _move(self, batch: list[int], result: _BatchResult, iteration: int) -> None:
@@ -134,12 +130,10 @@ class Stepper:
             factor=schedule.rate_factor(iteration))
 
 
-def next_view(state: TrainState, task: Task, blurred: BlurredSteps | None = None) -> int:
+def next_view(state: TrainState, task: Task) -> int:
     """Returns the view whose turn it is; every epoch has an order of its own."""
     while not state.queue:
-        order = torch.randperm(len(task.train), generator=state.generator)
-        state.queue = (order if blurred is None else blurred.draw(
-            order, state.generator, state.iteration + 1)).tolist()
+        state.queue = torch.randperm(len(task.train), generator=state.generator).tolist()
     return state.queue.pop()
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.deadline import Deadline
 from recon_cli.io.images import reduce_view
 from recon_cli.progress import Progress
 from recon_cli.scene.covisibility import observe_points
@@ -63,26 +64,33 @@ class SparseModel:
 
 
 class StereoPoints:
-    """The surfaces that some views show, searched when they are first asked for."""
+    """The surfaces that some views show, searched once."""
 
     def __init__(
         self, views: Sequence[TrainView], model: Callable[[], SparseModel], progress: Progress
     ) -> None:
         self._views, self._model, self._progress = views, model, progress
+        self._found: SurfacePoints | None = None
 
-    @cached_property
-    def found(self) -> SurfacePoints:
-        """Points on them, away from sparse points."""
-        return find_surfaces(self._views, self._model(), self._progress)
+    def search(self, deadline: Deadline | None = None) -> SurfacePoints:
+        """Returns points on them, away from sparse points; OutOfTime as `find_surfaces`."""
+        if self._found is None:
+            self._found = find_surfaces(self._views, self._model(), self._progress, deadline)
+        return self._found
 
 
 def find_surfaces(
-    views: Sequence[TrainView], model: SparseModel, progress: Progress
+    views: Sequence[TrainView], model: SparseModel, progress: Progress,
+    deadline: Deadline | None = None,
 ) -> SurfacePoints:
     """Returns points on surfaces that two views find, in cells without a sparse point.
 
     Brightness is compared after the gains that the sparse points show, of up to 60 views.
+
+    Raises:
+        OutOfTime: the search would not end in time.
     """
+    deadline = deadline or Deadline()
     rows = np.unique(np.linspace(
         0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int))
     chosen = [reduce_view(view, max(1.0, max(view.camera.width, view.camera.height) / _SIDE))
@@ -105,8 +113,15 @@ def find_surfaces(
     some = np.random.default_rng(0).permutation(len(model.points))[:_SAMPLES]
     partners = find_partners(
         [view.camera for view in chosen], model.points[some], seen[:, some], _NEIGHBOURS)
-    with progress.bar("stereo", 2 * len(photos), unit="view") as bar:
-        found = find_depths(photos, partners, _NEAR * median, bar.advance)
+    total = 2 * len(photos)
+    with progress.bar("stereo", total, unit="view") as bar:
+        done, pace = count(1), deadline.keep_pace(total)
+
+        def advance() -> None:
+            bar.advance()
+            pace(next(done))
+
+        found = find_depths(photos, partners, _NEAR * median, advance)
     return _merge(chosen, found, model.points, _CELL * median)
 
 

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.io.images import reduce_view
@@ -16,7 +14,6 @@ from recon_cli.scene.cells import Cell
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.shutter import ViewMotions
 from recon_cli.train.stereo_points import StereoPoints
 
 
@@ -35,9 +32,6 @@ class Task:
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
     stereo: StereoPoints | None = None  # of the training views; None where they are not known
     depth_refused: str = ""  # why no view has sensor depth although the capture has some
-    motions: ViewMotions | None = None  # of the views; None where no blur is looked for
-    # log2 of the exposure of each training view by EXIF, NaN where it is not known; None: of none
-    exposures: NDArray[np.float64] | None = None
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
         """Returns 1 for each position where Gaussians may be added, else 0."""

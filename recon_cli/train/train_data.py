@@ -31,7 +31,6 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.shutter import ViewMotions
 from recon_cli.train.stereo_points import SparseModel, StereoPoints
 from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import read_json, write_bytes
@@ -74,19 +73,12 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
         train = [view.page_locked() for view in train]
     nearness = scene.nearness if len(scene.points) else None
     validation = load_views(scene.validation, config, ctx, file)
-    motions = scene.motions
     return Task(
         train, [*validation], Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), nearness=nearness, cell=scene.cell,
         stereo=StereoPoints(
             train, lambda: _sparse_model(scene, [view.name for view in views]), ctx.progress),
-        depth_refused=sensor.refused,
-        motions=ViewMotions(
-            tuple(motions.get(view.name) for view in views),
-            tuple(motions.get(view.name) for view in validation), scene.points),
-        exposures=np.array([
-            scene.exposures.get(view.face_of or view.name, np.nan) for view in views]
-        ) if scene.exposures else None)
+        depth_refused=sensor.refused)
 
 
 def load_sensor_depth(scene: Scene, config: RunConfig) -> SensorViews:

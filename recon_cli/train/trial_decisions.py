@@ -23,10 +23,13 @@ _DENSEST = 3  # of few views; the rest must still hang together
 Arm = Callable[[], Sequence[float]]
 
 
-def skip_trial(name: str, reason: str) -> TrialDecision:
-    """Returns the decision against a part that nothing speaks for, untried."""
+NO_TIME = "there was no time to try it"  # the reason of what is decided without
+
+
+def skip_trial(name: str, reason: str, *, on: bool = False) -> TrialDecision:
+    """Returns the decision on a part that is not tried; against it where nothing speaks for it."""
     return TrialDecision(
-        name=name, on=False, mean_db=None, standard_error_db=None, reason=reason, seconds=0.0)
+        name=name, on=on, mean_db=None, standard_error_db=None, reason=reason, seconds=0.0)
 
 
 def decide(

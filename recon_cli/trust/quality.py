@@ -9,6 +9,7 @@ judgement, as there is no table of such scenes.
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +99,19 @@ def find_failed_views(metrics: Metrics | None) -> tuple[ViewScore, ...]:
     views = metrics.models[model].views if metrics and model else ()
     return tuple(sorted((view for view in views if view.psnr_db < POOR_PSNR_DB),
                         key=lambda view: view.psnr_db))
+
+
+def find_doubtful_cameras(metrics: Metrics | None) -> tuple[ViewScore, ...]:
+    """Returns the views that failed alone, as with a wrong camera, the worst first.
+
+    They are as far below the median view as poor is below good: a model that was trained too short
+    is blurred in all views.
+    """
+    model = delivered_model(metrics)
+    views = metrics.models[model].views if metrics and model else ()
+    usual = statistics.median([view.psnr_db for view in views] or [0.0])
+    return tuple(view for view in find_failed_views(metrics)
+                 if view.psnr_db < usual - (GOOD_PSNR_DB - POOR_PSNR_DB))
 
 
 def name_view(name: str, frames: Sequence[Frame]) -> str:

@@ -298,7 +298,6 @@ class PhotometrySummary(JsonRecord):
     FILE: typing.ClassVar[str] = "photometry.json"
 
     gain_spread: float | None = None  # standard deviation of the log-gains over the views
-    bend_spread: float | None = None  # and of the bends of their tone curves
     vignettes: tuple[VignetteSummary, ...] = ()  # of the cameras
 
     @classmethod

@@ -25,6 +25,7 @@ from recon_cli.evaluation.reference_views import load_reference_views, render_vi
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
+from recon_cli.stereo.depths import places
 from recon_cli.train import moving
 from recon_cli.train.photometry import read_falloffs
 
@@ -48,6 +49,18 @@ class Split:
     error: float
     parts: tuple[float, ...]  # in the order of CAUSES; they add up to `error`
     sharpness: float  # slopes of the photo over those of the render, root of the mean square
+
+
+def count_witnesses(
+    own: moving.ComparedView, views: Sequence[moving.ComparedView]
+) -> NDArray[np.int64]:
+    """Returns how many of `views` see the surface in each pixel [H, W] of another view."""
+    pixels = np.flatnonzero(own.depth.reshape(-1) > 0)
+    where = places(own.camera, own.depth, pixels)
+    count = np.zeros(own.depth.size, np.int64)
+    for other in views:
+        count[pixels] += moving.sees(other, where)
+    return count.reshape(own.depth.shape)
 
 
 def split_view(draw: Draw, view: TrainView, few: Mask, moves: Mask) -> Split:
@@ -179,7 +192,7 @@ def split_workspace(workspace: Path) -> list[Split]:
     splits = []
     for view, one, moves in zip(
             views, held_out, moving.find_moving(held_out, others), strict=True):
-        few = moving.count_witnesses(one, others) < _FEW
+        few = count_witnesses(one, others) < _FEW
         size = view.camera.width, view.camera.height
         large = [cv2.resize(part.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
                  for part in (few, moves)]

@@ -1,27 +1,24 @@
-"""What fitting the light of images is worth: gains, vignettes and tone curves, alone or together.
+"""What fitting the light of images is worth: gains and vignettes, alone or together.
 
-    python tests/bench/bench_light.py WORKSPACE ... --parts "" --parts exposure,tone --parts auto
+    python tests/bench/bench_light.py WORKSPACE ... --parts "" --parts vignette --parts auto
 
 Each row is a run with the parts on that it names; without any it is the recipe as it is, and `auto`
 are those that the trials of `recon train` choose at 600 pixels. Held-out views are scored as they
 are, after the best gain of each, and after the mean gain of the training views before and after in
 time, which a run with exposures knows without the held-out view. A fitted vignette shades the
 renders, as `recon eval` does. The last rows are means over the captures, with the gain over the
-first row. Where photos tell their exposure by EXIF, its column holds the correlation of gains by
-sparse points with it, their slope against it, and what their spread falls to.
+first row.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import statistics
 import time
 from pathlib import Path
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 from workbench import (
     numba_context,
     open_scene,
@@ -37,15 +34,15 @@ from recon_cli.evaluation.metrics import corrected_psnr, psnr
 from recon_cli.evaluation.reference_views import load_reference_views, render_view
 from recon_cli.io.views import ReferenceView
 from recon_cli.scene.scene import Scene
-from recon_cli.train.exposure import Estimate, estimate_gains
+from recon_cli.train.exposure import estimate_gains
 from recon_cli.train.feature_trials import TrialScene, examine
-from recon_cli.train.photometric_evidence import find_photometry
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task
+from recon_cli.train.vignette_evidence import find_vignettes
 
-PARTS = ("exposure", "vignette", "tone")
+PARTS = ("exposure", "vignette")
 TRIAL_SIZE = 600  # pixels; of `recon train` by default
 
 
@@ -78,22 +75,9 @@ def choose_parts(scene: Scene, config: RunConfig, ctx: StageContext) -> str:
     return ",".join(part for part in PARTS if getattr(chosen, part) == "on")
 
 
-def compare_exif(drift: Estimate, exposures: NDArray[np.float64] | None) -> str:
-    """Returns correlation and slope of gains by points on those by EXIF, and their spreads."""
-    if exposures is None:
-        return ""
-    known = np.isfinite(exposures)
-    nominal, found = math.log(2) * exposures[known], drift.log_gains[known].mean(axis=1)
-    if known.sum() < 3 or nominal.std() == 0:
-        return ""
-    slope, offset = np.polyfit(nominal, found, 1)
-    rest = (found - slope * nominal - offset).std()
-    return f"{np.corrcoef(nominal, found)[0, 1]:.2f}, {slope:.2f}, {found.std():.3f} to {rest:.3f}"
-
-
 @click.command()
 @workspaces_argument
-@click.option("--parts", "chosen", multiple=True, default=("", "exposure", "vignette", "tone"),
+@click.option("--parts", "chosen", multiple=True, default=("", "exposure", "vignette"),
               show_default=True, help="PART,... that are on in a row, or auto.")
 @click.option("--seeds", default=1, show_default=True)
 @click.option("--iterations", default=900, show_default=True)
@@ -103,20 +87,18 @@ def main(workspaces: tuple[Path, ...], chosen: tuple[str, ...], seeds: int, iter
          max_size: int, max_gaussians: int) -> None:
     """Print the held-out PSNR with the parts that take light out of the scene."""
     ctx = numba_context(1)
-    print_head("capture", "drift, place, corner, bends", "EXIF", "parts", "as is",
+    print_head("capture", "drift, place, corner", "parts", "as is",
                "after best gain", "after neighbours' gain", "CPU s")
     scores: dict[str, list[tuple[float, ...]]] = {words: [] for words in chosen}
     for workspace in workspaces:
         scene = open_scene(workspace, 0.0)
         base = RunConfig(
             iterations=iterations, max_size=max_size, max_gaussians=max_gaussians, sh_degree=1,
-            images="original", far="on", stereo="off", blur="off", moving="off", early_stop=False)
+            images="original", far="on", stereo="off", moving="off", early_stop=False)
         task = load_task(scene, base, ctx)
         drift = estimate_gains(task.train, scene.points)
-        light = find_photometry(task.train, scene.points)
-        signs = (f"{drift.spread:.3f}, {drift.local:.2f}, {light.corner_loss:.3f}, "
-                 f"{light.bend_spread:.3f}")
-        exif = compare_exif(drift, task.exposures)
+        corners = find_vignettes(task.train, scene.points).corner_loss
+        signs = f"{drift.spread:.3f}, {drift.local:.2f}, {corners:.3f}"
         views = load_reference_views(scene.test, max_size, ctx)
         known: dict[str, tuple[float | None, ...]] = {}  # a choice of trials may be a row as well
         for words in chosen:
@@ -133,13 +115,13 @@ def main(workspaces: tuple[Path, ...], chosen: tuple[str, ...], seeds: int, iter
                                   for column in zip(*found, strict=True))
             scores[words].append(known[on][:2])
             name = f"auto: {on or 'none'}" if words == "auto" else words or "none"
-            print_row(workspace.name, signs, exif, name,
+            print_row(workspace.name, signs, name,
                       *("" if cell is None else f"{cell:.2f}" for cell in known[on]),
                       f"{(time.process_time() - start) / seeds:.0f}")
     first = np.mean(scores[chosen[0]], axis=0)
     for words in chosen:
         means = np.mean(scores[words], axis=0)
-        print_row(f"mean of {len(workspaces)}", "", "", words or "none",
+        print_row(f"mean of {len(workspaces)}", "", words or "none",
                   *(f"{mean:.2f} ({mean - before:+.2f})"
                     for mean, before in zip(means, first, strict=True)), "", "")
 

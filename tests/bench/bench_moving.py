@@ -1,12 +1,11 @@
-"""Trains scenes through which people walk, or in which a chair is moved, with masks and without.
+"""Trains scenes through which people walk, with masks and without.
 
     python tests/bench/bench_moving.py ../shared/data/rooms/living --things people
 
 A scene is a folder of rooms (exact poses and depth; its novel views are scored) or a workspace with
 a trained model, whose depth says what hides what; its held-out views are scored. People are in a
-third of the training views; the views that are scored hold nobody. The chair stands in one place in
-the first half of the capture and in another in the second. The last training has exact masks: more
-than that masks cannot gain.
+third of the training views; the views that are scored hold nobody. The last training has exact
+masks: more than that masks cannot gain.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext
-from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr, render_view
+from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr
 from recon_cli.io.images import read_image, read_mask, write_png
 from recon_cli.io.views import ReferenceView
 from recon_cli.render.surface_depth import render_surface
@@ -193,63 +192,6 @@ def standing(cameras: Sequence[Camera]) -> list[Things]:
     return here
 
 
-def chairs(cameras: Sequence[Camera], points: Array) -> tuple[list[Things], list[Array]]:
-    """Returns which chair is in which training view, and the two places where it stands.
-
-    The floor is searched for places that many views of each half see from a distance.
-    """
-    half = len(cameras) // 2
-    low, high = np.percentile(points[:, :2], [10, 90], axis=0)
-    places = [np.array([x, y]) for x in np.linspace(low[0], high[0], 9)
-              for y in np.linspace(low[1], high[1], 9)]
-    counts = np.array([_seen_by_half(cameras, place) for place in places])
-    # each where one half saw it more, and both saw it
-    first = int(np.argmax(np.where(counts[:, 0] > counts[:, 1], counts.min(axis=1), -1)))
-    second = int(np.argmax(np.where(counts[:, 1] > counts[:, 0], counts.min(axis=1), -1)))
-    chosen = [places[first], places[second]]
-    stands = [made_people.chair(place, 0.7) for place in chosen]
-    return [[stands[0] if row < half else stands[1]] for row in range(len(cameras))], chosen
-
-
-def _seen_by_half(cameras: Sequence[Camera], place: Array) -> tuple[int, int]:
-    rows = [_shows(camera, np.array([*place, 0.45])) for camera in cameras]
-    return sum(rows[:len(rows) // 2]), sum(rows[len(rows) // 2:])
-
-
-def _shows(camera: Camera, place: Array) -> bool:
-    """Returns whether a camera has a place well inside its image, not too near."""
-    x, y, z = camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3]
-    return bool(z > 1.2 and 0.1 < (camera.fx * x / z + camera.cx) / camera.width < 0.9
-                and 0.1 < (camera.fy * y / z + camera.cy) / camera.height < 0.9)
-
-
-def ghosts(
-    stage: Stage, model: Splats, config: TrainConfig, places: Sequence[Array]
-) -> list[float]:
-    """Returns how much of the rarer state shows where the chair stood, 0 to 1, for each place.
-
-    In the pixels of the chair in held-out views a render is compared with the photo and with the
-    photo with the chair: it is a mixture of both.
-    """
-    found = []
-    for index, place in enumerate(places):
-        by_half = _seen_by_half(stage.cameras, place)
-        there = by_half[index] > by_half[1 - index]
-        top = bottom = 0.0
-        for view in stage.scene.test:
-            if not _shows(stage.metres.camera(view.camera), np.array([*place, 0.45])):
-                continue
-            with_it, solid, _ = stage.draw_one(view, [made_people.chair(place, 0.7)])
-            empty = read_image(view.original, view.camera.width, view.camera.height)
-            usual, rare = (with_it, empty) if there else (empty, with_it)
-            rgb = 255 * render_view(model, view.camera, config.sh_degree or 0, "numba").rgb.numpy()
-            apart = (rare.astype(float) - usual)[solid]
-            top += float(((rgb - usual)[solid] * apart).sum())
-            bottom += float((apart**2).sum())
-        found.append(top / max(bottom, 1e-9))
-    return found
-
-
 def train(scene: Scene, config: TrainConfig, out: Path) -> tuple[Splats, float, TrainPlan]:
     """Returns the Gaussians of a training, its CPU seconds, and its plan."""
     shutil.rmtree(out, ignore_errors=True)
@@ -288,8 +230,7 @@ def mark_places(
 ) -> list[TrainView]:
     """Returns held-out views of which only the pixels count where a thing stood at some time."""
     by_name = {view.name: view for view in stage.scene.test}
-    # a chair is the same thing in many views
-    every = list({id(thing): thing for here in things[::_SAMPLED] for thing in here}.values())
+    every = [thing for here in things[::_SAMPLED] for thing in here]
     marked = []
     for view in held_out:
         _, solid, _ = stage.draw_one(by_name[view.name], every)
@@ -313,20 +254,14 @@ def with_ideal_masks(made: Scene, drawn: Drawn, out: Path) -> Scene:
     return dataclasses.replace(made, train=tuple(views))
 
 
-def choose_things(stage: Stage, kind: str) -> tuple[list[Things], list[Array]]:
-    """Returns the things in each training view, and the places of a chair."""
-    if kind == "chair":
-        metres = stage.metres
-        points = stage.scene.points @ metres.turn.T / metres.unit  # up to the shift along z
-        return chairs(stage.cameras, points)
-    return {"people": people, "standing": standing}[kind](stage.cameras), []
+KINDS = {"people": people, "standing": standing}
 
 
 @workbench.click.command()
 @workbench.click.argument("folder", type=workbench.FOLDER)
 @workbench.click.argument("out", type=workbench.click.Path(path_type=Path))
 @workbench.click.option("--things", "kind", default="people",
-                        type=workbench.click.Choice(["people", "standing", "chair"]))
+                        type=workbench.click.Choice([*KINDS]))
 @workbench.click.option("--iterations", default=1000)
 @workbench.click.option("--max-size", default=320)
 @workbench.click.option("--only", multiple=True, help="Trainings, of those in the table.")
@@ -344,12 +279,12 @@ def main(
     else:
         clean, seconds, _ = train(scene, config, out / "clean")
     stage = Stage(scene, splats or clean, Metres.from_scene(scene))
-    things, places = choose_things(stage, kind)
+    things = KINDS[kind](stage.cameras)
     for name in ("photos", "ideal-masks"):
         shutil.rmtree(out / name, ignore_errors=True)
     made, drawn = stage.draw_into(things, out / "photos")
     workbench.print_head("training", "path dB", "novel dB", "where things were", "things masked",
-                         "shadows", "others", "ghost A", "ghost B", "CPU s")
+                         "shadows", "others", "CPU s")
     held_out = load_reference_views(scene.test, max_size)
     sides: list[Sequence[TrainView]] = [
         [view for view in held_out if view.name.startswith("test_") is novel]
@@ -358,9 +293,8 @@ def main(
 
     def show(name: str, model: Splats, seconds: float) -> None:
         scores = [f"{mean_psnr(model, side, 1, 'numba'):.2f}" if side else "" for side in sides]
-        marks = [f"{value:.2f}" for value in ghosts(stage, model, config, places)]
         masked = [f"{100 * share:.1f}%" for share in found_shares(scene, out / name, drawn)]
-        workbench.print_row(name, *scores, *masked, *(marks or ["", ""]), f"{seconds:.0f}")
+        workbench.print_row(name, *scores, *masked, f"{seconds:.0f}")
 
     show("clean", clean, seconds)
     for name, moving in (("without", "off"), ("with", "auto"), ("ideal", "off")):

@@ -1,7 +1,7 @@
-"""People who walk through photos and a chair that is moved, drawn into views with known depth.
+"""People who walk through photos, drawn into views with known depth.
 
-Solids are met by the ray of each pixel: ellipsoids make a person, boxes a chair. The nearer of
-solid and room is seen, and on the floor lies a shadow. World z is up and the floor at 0.
+The ellipsoids of a person are met by the ray of each pixel. The nearer of solid and room is seen,
+and on the floor lies a shadow. World z is up and the floor at 0.
 """
 
 from __future__ import annotations
@@ -23,14 +23,13 @@ _SHADOW = 0.45  # of the light that is taken away in its middle
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """An ellipsoid, or a box: |x / half| <= 1 in the axes of `turn`, by one norm or another."""
+    """An ellipsoid: |x / half| <= 1 in the axes of `turn`."""
 
     middle: Array  # [3]
     half: Array  # [3] half lengths
     turn: Array  # [3, 3] rotation, own axes in columns
     color: Array  # [3] 0 to 1
     stripes: float = 0.0  # of them per unit of height
-    box: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +66,6 @@ def person(foot: Array, heading: float, walked: float, height: float = 1.7) -> T
         Solid(at + turn @ (unit * np.array(middle)), unit * np.array(half), turn, color,
               stripes / unit) for middle, half, color, stripes in parts),
         np.asarray(foot), 0.3 * unit)
-
-
-def chair(foot: Array, heading: float, height: float = 0.9) -> Thing:
-    """Returns a chair of a height whose back is behind `heading`."""
-    turn, unit = _about_z(heading), height / 0.9
-    wood, seat = np.array((0.55, 0.33, 0.12)), np.array((0.1, 0.42, 0.35))
-    parts = [((0, 0, 0.45), (0.22, 0.22, 0.03), seat), ((-0.2, 0, 0.7), (0.025, 0.2, 0.2), seat)]
-    parts += [((x, y, 0.22), (0.025, 0.025, 0.22), wood) for x in (-0.19, 0.19)
-              for y in (-0.19, 0.19)]
-    at = np.array([*foot, 0.0])
-    return Thing(tuple(
-        Solid(at + turn @ (unit * np.array(middle)), unit * np.array(half), turn, color, box=True)
-        for middle, half, color in parts), np.asarray(foot), 0.25 * unit)
 
 
 def draw(
@@ -128,21 +114,11 @@ def _meet(solid: Solid, eye: Array, rays: Array) -> tuple[Array, Array]:
     """Returns the depth [N] at which rays meet a solid, infinite for none, and normals [N, 3]."""
     start = (eye - solid.middle) @ solid.turn / solid.half
     along = rays @ solid.turn / solid.half
-    if solid.box:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sides = np.stack([(-1 - start) / along, (1 - start) / along])
-        enter, leave = sides.min(axis=0), sides.max(axis=0)
-        distance = enter.max(axis=1)
-        met = (distance < leave.min(axis=1)) & (distance > 0)
-        axis = enter.argmax(axis=1)
-        own = np.zeros_like(along)
-        own[np.arange(len(own)), axis] = -np.sign(along[np.arange(len(own)), axis])
-    else:
-        a, b, c = (along**2).sum(1), along @ start, start @ start - 1
-        root = b * b - a * c
-        distance = (-b - np.sqrt(np.maximum(root, 0))) / a
-        met = (root > 0) & (distance > 0)
-        own = start + along * distance[:, None]
+    a, b, c = (along**2).sum(1), along @ start, start @ start - 1
+    root = b * b - a * c
+    distance = (-b - np.sqrt(np.maximum(root, 0))) / a
+    met = (root > 0) & (distance > 0)
+    own = start + along * distance[:, None]
     normal = (own / solid.half) @ solid.turn.T
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return np.where(met, distance, np.inf), normal

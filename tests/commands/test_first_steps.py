@@ -177,7 +177,7 @@ def test_a_time_and_a_number_of_steps_are_refused_before_anything_runs(tmp_path,
 def test_choices_for_a_time_are_kept_for_the_same_time_and_input(tmp_path):
     call = Call(workspace=tmp_path)
     video = tmp_path / "a.mp4"
-    chosen = Budget(minutes=5.0, inputs=(str(video),), frames=40, train_minutes=1.5, prune=True)
+    chosen = Budget(minutes=5.0, inputs=(str(video),), max_frames=40, train_minutes=1.5, prune=True)
     (tmp_path / budget.FILE).write_text(json.dumps(chosen.to_json()))
     assert budget._recorded(call, 5.0, (video,)) == chosen
     assert budget._recorded(call, 5.0, ()) == chosen

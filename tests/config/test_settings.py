@@ -34,7 +34,8 @@ def test_toml_round_trips_every_section(tmp_path: Path) -> None:
     ("[trian]\niterations = 3", "section trian", "Did you mean train?"),
     ("[train]\niteration = 3", "train.iteration,", "Did you mean iterations?"),
     ("[train]\nxyz = 3", "train.xyz", "quality, minutes"),
-    ("[train]\nposes = 'on'", "train.poses, which does not exist", "leave it out"),  # a past one
+    ("[train]\nposes = 'on'", "train.poses, which recon no longer has", "Delete the line poses ="),
+    ("[train]\ntone = 'auto'", "train.tone, which recon no longer has", "Delete the line tone ="),
     ("train = 3", "it is a section", "[train]"),
     ("[train]\ndensify = 'swarm'", "train.densify is 'swarm'", "--densify"),
     ("[prune]\nratio = 2", "prune.ratio is 2.0", "--ratio"),
@@ -141,6 +142,7 @@ def test_segments_that_cannot_be_are_refused(options: dict[str, str], said: str)
 @pytest.mark.parametrize(("text", "left"), [
     ('[train]\nposes = "off"\niterations = 60\n', {"train": {"iterations": 60}}),
     ("[train]\ndensify_scale = 0.01\n", {"train": {}}),
+    ("[train]\ntone = 'off'\nblur = 'auto'\n", {"train": {}}),
     ("[merge]\nvalidation = 0.05\n", {})])
 def test_options_that_are_gone_may_ask_for_what_is_done_anyway(text, left, tmp_path):
     path = tmp_path / "recon.toml"
@@ -148,10 +150,17 @@ def test_options_that_are_gone_may_ask_for_what_is_done_anyway(text, left, tmp_p
     assert layers.read_settings(path) == left
 
 
-@pytest.mark.parametrize("text", ['[train]\nposes = "on"\n', "[merge]\nvalidation = 0.2\n"])
+@pytest.mark.parametrize("text", [
+    '[train]\nposes = "on"\n', "[merge]\nvalidation = 0.2\n", '[train]\nblur = "on"\n',
+    "[train]\nshutter = 0.02\n"])
 def test_options_that_are_gone_are_refused_where_they_ask_for_more(text, tmp_path):
     path = tmp_path / "recon.toml"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match="does not exist") as caught:
+    with pytest.raises(ConfigError, match=r"does not exist|no longer has") as caught:
         layers.read_settings(path)
     assert caught.value.hint
+
+
+def test_an_option_that_is_gone_is_no_assignment():
+    with pytest.raises(ConfigError, match=r"--set sets train\.blur, which recon no longer has"):
+        layers.parse_assignment("train.blur=on")

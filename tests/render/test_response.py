@@ -18,9 +18,7 @@ from recon_cli.render.response import (
 CAMERA = camera_at(24, 17)
 RESPONSES = {
     "gain": Response(np.array([1.3, 1.0, 0.8], np.float32)),
-    "vignette": Response(np.array([1.1, 1.0, 0.9], np.float32), vignette=(-0.3, -0.2)),
-    "bend": Response(np.array([1.1, 1.0, 0.9], np.float32), bend=0.2),
-    "all": Response(np.array([1.1, 1.0, 0.9], np.float32), vignette=(-0.3, -0.2), bend=-0.3)}
+    "vignette": Response(np.array([1.1, 1.0, 0.9], np.float32), vignette=(-0.3, -0.2))}
 TOLERANCE = 1e-5  # of float32 against float64, relative in the 2-norm
 
 
@@ -40,19 +38,6 @@ def test_a_vignette_takes_nothing_at_the_principal_point_and_its_exponents_at_th
     assert np.log(left) == pytest.approx(-0.3 * squares - 0.2 * squares**2, abs=1e-6)
 
 
-def test_a_curve_keeps_black_and_white_and_rises():
-    rising = np.linspace(-0.2, 1.2, 17 * 24 * 3, dtype=np.float32).reshape(17, 24, 3)
-    for bend in (-0.5, 0.5):
-        image = rising.copy().reshape(17, -1)
-        ResponsePass(Response(np.ones(3, np.float32), bend=bend), CAMERA).forward(image)
-        flat = image.reshape(-1)
-        assert (np.diff(flat) > 0).all()
-        outside = (rising.reshape(-1) <= 0) | (rising.reshape(-1) >= 1)
-        assert np.array_equal(flat[outside], rising.reshape(-1)[outside])
-        middle = np.abs(rising.reshape(-1) - 0.5).argmin()
-        assert flat[middle] == pytest.approx(0.5 + bend / 4, abs=1e-3)
-
-
 @pytest.mark.parametrize("name", RESPONSES)
 def test_the_closed_form_has_the_gradients_of_float64(name):
     response, render, pull = RESPONSES[name], picture(1), picture(2)
@@ -67,29 +52,27 @@ def test_the_closed_form_has_the_gradients_of_float64(name):
     found, truth = closed.backward(image, gradient), tensors.gradient()
     assert np.linalg.norm(gradient.reshape(render.shape) - leaf.grad.numpy()) <= (
         TOLERANCE * np.linalg.norm(leaf.grad.numpy()))
-    for ours, theirs in ((found.log_gain, truth.log_gain), (found.vignette, truth.vignette),
-                         (np.array([found.bend]), np.array([truth.bend]))):
+    for ours, theirs in ((found.log_gain, truth.log_gain), (found.vignette, truth.vignette)):
         assert np.linalg.norm(ours - theirs) <= TOLERANCE * max(np.linalg.norm(theirs), 1)
 
 
 def test_the_gradients_are_slopes():
     render, pull, reach = picture(3).astype(np.float64), picture(4).astype(np.float64), 1e-6
 
-    def value(log_gain, a, b, bend):
+    def value(log_gain, a, b):
         squares = squared_distances(CAMERA).astype(np.float64)[..., None]
         light = render * np.exp(np.asarray(log_gain) + a * squares + b * squares**2)
-        inside = light.clip(0, 1)
-        return float(((light + bend * inside * (1 - inside)) * pull).sum())
+        return float((light * pull).sum())
 
-    response = Response(np.exp([0.1, 0.0, -0.1]).astype(np.float32), (-0.3, -0.2), 0.2)
+    response = Response(np.exp([0.1, 0.0, -0.1]).astype(np.float32), (-0.3, -0.2))
     log_gain = np.log(response.gain.astype(np.float64))
     leaf = torch.from_numpy(render)
     tensors = ResponseTensors(response, CAMERA, leaf)
     (tensors.apply(leaf) * torch.from_numpy(pull)).sum().backward()
     found = tensors.gradient()
-    places = np.array([*log_gain, -0.3, -0.2, 0.2])
-    for axis, slope in enumerate([*found.log_gain, *found.vignette, found.bend]):
-        move = reach * np.eye(6)[axis]
+    places = np.array([*log_gain, -0.3, -0.2])
+    for axis, slope in enumerate([*found.log_gain, *found.vignette]):
+        move = reach * np.eye(5)[axis]
         ends = [value(at[:3], *at[3:]) for at in (places + move, places - move)]
         assert slope == pytest.approx((ends[0] - ends[1]) / (2 * reach), rel=1e-4, abs=1e-4)
 

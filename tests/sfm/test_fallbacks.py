@@ -3,6 +3,7 @@ import io
 import json
 import math
 import sqlite3
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -280,6 +281,34 @@ def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
     result = build(job, deadline=0.0)
     assert [bool(attempt.skipped) for attempt in result.attempts] == [False, True, True]
     assert result.parts[0].registered == job.names
+
+
+@pytest.mark.usefixtures("few_pairs")
+@pytest.mark.parametrize(("least", "tried"), [(0.5, [True, False, False]), (1.1, [True] * 3)])
+def test_late_mappers_improve_no_model_that_is_enough_but_replace_one_that_is_not(
+        capture, monkeypatch, least, tried):
+    job, _ = capture
+    monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "some frames are apart")
+    monkeypatch.setattr(fallbacks.checks, "check_registered", lambda *_: None)
+    result = build(replace(job, min_registered=least, max_minutes=20.0, spare_minutes=0.0),
+                   deadline=time.monotonic() + 60 * 20)
+    assert [not attempt.skipped for attempt in result.attempts] == tried
+    assert result.parts[0].registered == job.names
+
+
+@pytest.mark.parametrize(("held", "trusted", "minutes"), [
+    (58, True, 17.0), (40, True, 14.0), (40, False, 0.0), (20, True, 0.0)])
+def test_a_model_that_lacks_frames_is_worth_more_of_the_time(capture, held, trusted, minutes):
+    job = replace(sized(capture[0], 60), max_minutes=20.0, spare_minutes=3.0)
+    attempt = replace(GOOD, registered=NAMES[:held], trusted=trusted)
+    assert fallbacks._unneeded_minutes(job, [attempt]) == minutes
+
+
+def test_a_job_has_less_time_left_after_some_of_it(capture):
+    job = replace(capture[0], max_minutes=20.0, spare_minutes=3.0)
+    assert (job.after(2.0).max_minutes, job.after(2.0).spare_minutes) == (18.0, 1.0)
+    assert job.after(5.0).spare_minutes == 0.0
+    assert replace(job, spare_minutes=None).after(5.0).spare_minutes is None
 
 
 @pytest.mark.usefixtures("few_pairs")

@@ -307,7 +307,7 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
     def chosen(backend="triton", importance=None, *, exposure=False, **changes):
         config = dataclasses.replace(CONFIG, **changes)
         state, task = first(backend, config), task_of(backend, config)
-        state.photometry = Photometry.from_parts(Exposure(3) if exposure else None, None, None)
+        state.photometry = Photometry.from_parts(Exposure(3) if exposure else None, None)
         found = async_trainer.choose_trainer(state, task, importance, lambda _: False)
         return type(found.__self__)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from wall_scene import CONFIG, scene
 
+from recon_cli.deadline import Deadline
 from recon_cli.train.feature_trials import examine
 
 pytestmark = pytest.mark.integration
@@ -17,8 +18,8 @@ def reasons(needs):
 def test_a_plain_scene_needs_nothing_and_pays_nothing():
     needs = examine(scene())
     assert needs.config.far == needs.config.exposure == "off"
-    assert needs.config.vignette == needs.config.tone == "off"
-    assert needs.seconds == 0
+    assert needs.config.vignette == "off"
+    assert not any(one.seconds for one in needs.decisions)
     assert needs.moving is None
     assert "cover all" in reasons(needs)["far"]
     assert "differs by" in reasons(needs)["exposure"]
@@ -40,19 +41,17 @@ def test_a_camera_that_sets_its_exposure_is_found_and_helped():
 
 
 def test_a_lens_with_dark_corners_is_found_and_helped():
-    config = replace(CONFIG, tone="auto")
-    needs = examine(scene(vignette=(-0.5, -0.3), config=config))
+    needs = examine(scene(vignette=(-0.5, -0.3)))
     decision = next(one for one in needs.decisions if one.name == "vignette")
     assert decision.on, decision.reason
     assert needs.config.vignette == "on"
-    assert needs.config.tone == "off"
 
 
 def test_one_exposure_for_all_needs_no_trial_but_a_drift():
     config = replace(CONFIG, look="even", far="off", moving="off")
     even, plain = examine(scene(drift=0.15, config=config)), examine(scene(config=config))
     assert (even.config.exposure, plain.config.exposure) == ("on", "off")
-    assert even.seconds == 0
+    assert not any(one.seconds for one in even.decisions)
     assert reasons(even)["exposure"].startswith("one exposure")
 
 
@@ -64,8 +63,7 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 def test_what_the_options_say_is_not_tried():
     config = replace(
-        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", blur="off",
-        vignette="off", tone="off")
+        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", vignette="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config
@@ -87,3 +85,35 @@ def test_the_same_scene_gets_the_same_answer():
     first, second = (examine(scene(window=True)) for _ in range(2))
     assert first.config == second.config
     assert [one.mean_db for one in first.decisions] == [one.mean_db for one in second.decisions]
+
+
+class Ticking:
+    """A clock that goes on at each look, which every step of a limited trial takes."""
+
+    def __init__(self, seconds):
+        self.now, self.seconds = 0.0, seconds
+
+    def __call__(self):
+        self.now += self.seconds
+        return self.now
+
+
+def test_trials_that_would_end_late_are_cut_and_parts_are_as_without_evidence():
+    clock = Ticking(0.05)
+    deadline = Deadline(15.0, clock)  # of some 400 steps; a trial takes 800
+    needs = examine(replace(scene(window=True, drift=0.15), deadline=deadline, harmonics=True))
+    assert [one.name for one in needs.untried] == [
+        "far", "exposure", "harmonics above degree 0", "moving"][:len(needs.untried)]
+    assert len(needs.untried) >= 3
+    assert (needs.config.far, needs.config.exposure) == ("on", "off")
+    assert needs.config.sh_degree == CONFIG.sh_degree
+    assert needs.moving is None
+    assert clock.now < 15
+
+
+def test_a_time_that_suffices_changes_no_decision():
+    free, limited = (examine(replace(scene(window=True), deadline=deadline))
+                     for deadline in (Deadline(), Deadline(1e6)))
+    assert free.config == limited.config
+    assert [one.mean_db for one in free.decisions] == [one.mean_db for one in limited.decisions]
+    assert limited.untried == ()

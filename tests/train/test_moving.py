@@ -128,7 +128,7 @@ def test_surfaces_hidden_from_others_are_not_judged():
 def test_a_capture_whose_model_is_poor_is_not_judged():
     some = [replace(view, error=10 * view.error) for view in views()]
     paint(some[5], slice(20, 60), slice(60, 80), 0.6)
-    assert moving.noise_level(some) > moving.TOO_NOISY
+    assert moving.noise_level(some) > moving._TOO_NOISY
     assert not any(area(find_moving(some)))
 
 

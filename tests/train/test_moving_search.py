@@ -58,7 +58,7 @@ def test_what_is_carried_past_is_masked_and_little_else():
 def test_off_looks_for_nothing_and_on_skips_the_trial():
     made = scene()
     views, _ = carried(made.task.train)
-    needs = examine(with_views(made, views, **PARTS, blur="off", moving="off"))
+    needs = examine(with_views(made, views, **PARTS, moving="off"))
     assert needs.moving is None
     assert needs.decisions == ()
     needs = examine(with_views(made, views, **PARTS, moving="on"))

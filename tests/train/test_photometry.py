@@ -11,7 +11,6 @@ from recon_cli.render.response import transmission
 from recon_cli.train.exposure import Exposure
 from recon_cli.train.fit import fit
 from recon_cli.train.photometry import (
-    Curves,
     Photometry,
     Vignettes,
     falling,
@@ -22,15 +21,14 @@ from recon_cli.train.state import load_state, save_state
 from recon_cli.workspace.summaries import PhotometrySummary
 
 pytestmark = pytest.mark.integration
-ALL = replace(CONFIG, exposure="on", tone="on", vignette="on", sh_degree=1)
+ALL = replace(CONFIG, exposure="on", vignette="on", sh_degree=1)
 
 
 def photometry(task, seed=0):
     count = len(task.train)
     start = np.random.default_rng(seed).normal(0, 0.2, (count, 3))
     return Photometry(
-        Exposure(count, start=start), Curves(count, start=start[:, 0] / 2),
-        Vignettes([view.camera for view in task.train]))
+        Exposure(count, start=start), Vignettes([view.camera for view in task.train]))
 
 
 @pytest.mark.parametrize("until", [17, 45])
@@ -51,17 +49,6 @@ def test_a_run_that_is_saved_and_loaded_ends_with_the_same_bytes(tmp_path, until
     for name, value in whole.photometry.tensors().items():
         assert torch.equal(value, halves.photometry.tensors()[name]), name
     assert not np.array_equal(whole.photometry.vignettes.exponents, before)
-
-
-def test_bends_keep_a_mean_of_zero_and_curves_that_rise():
-    curves = Curves(4)
-    for i in range(800):
-        curves.step(i % 4, -1.0 if i % 4 else 1.0, 0.0)
-        assert np.abs(curves.bends).max() <= 0.5
-    assert curves.bends[0] == -0.5
-    mild = Curves(3, start=np.array([0.3, 0.1, 0.2]))
-    mild.step(1, 1.0, 0.5)
-    assert mild.bends.mean() == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("asked", [
@@ -93,7 +80,6 @@ def test_what_was_found_is_recorded_and_read_by_evaluation(tmp_path):
     write_photometry(tmp_path, made)
     record = PhotometrySummary.read(tmp_path)
     assert record.gain_spread == pytest.approx(made.exposure.log_gains.std(axis=0).max(), abs=1e-4)
-    assert record.bend_spread == pytest.approx(made.curves.bends.std(), abs=1e-4)
     camera = task.train[0].camera
     white = np.ones((camera.height, camera.width, 3), np.float32)
     shaded = read_falloffs(tmp_path).shade(white, camera)
@@ -105,5 +91,5 @@ def test_nothing_is_recorded_where_nothing_was_fitted(tmp_path):
     write_photometry(tmp_path, None)
     assert not list(tmp_path.iterdir())
     assert read_falloffs(tmp_path) is None
-    write_photometry(tmp_path, Photometry(Exposure(3), None, None))
+    write_photometry(tmp_path, Photometry(Exposure(3), None))
     assert read_falloffs(tmp_path) is None

@@ -1,7 +1,7 @@
 """Decisions that the user left open: in closed form, on a model of known cost."""
 
 from dataclasses import replace
-from functools import cached_property
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +10,7 @@ from scenes import camera_at
 from tiny_task import tiny_task
 
 from recon_cli.config.stages import RunConfig, TrainConfig
+from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.errors import ConfigError
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import plan
@@ -17,6 +18,8 @@ from recon_cli.train.cost import CostModel, LevelCost
 from recon_cli.train.feature_trials import Needs
 from recon_cli.train.plan import QUALITIES, Facts, make_plan
 from recon_cli.train.stereo_points import SurfacePoints
+from recon_cli.train.train_data import read_config
+from recon_cli.train.trial_decisions import NO_TIME, skip_trial
 from recon_cli.workspace.summaries import TrainPlan
 
 FACTS = Facts(detail=60_000, views=40, points=9000, room=10**9)
@@ -53,31 +56,113 @@ def test_minutes_are_filled_calibration_included(minutes):
     assert made.seconds + COST.seconds <= 60 * minutes
 
 
-def test_minutes_include_a_search_for_surfaces_that_only_the_longer_run_has_room_for(
-        tmp_path, monkeypatch):
-    now = [0.0]
+class FakeClock:
+    """A clock that parts of a training move on."""
 
-    class Slow:
-        @cached_property
-        def found(self):
-            now[0] += 20.0
-            return SurfacePoints.nothing()
+    def __init__(self):
+        self.now = 0.0
 
+    def __call__(self):
+        return self.now
+
+    def photos(self, seconds, views=60):
+        """Stands for a search in so many views, which takes so many seconds unless it is cut."""
+        class Search:
+            def search(_, deadline=None):  # noqa: N805
+                pace = (deadline or Deadline()).keep_pace(views)
+                for done in range(1, views + 1):
+                    self.now += seconds / views
+                    pace(done)
+                return SurfacePoints.nothing()
+
+        return Search()
+
+
+def planned(tmp_path, monkeypatch, *, minutes, trials=0.0, surfaces=0.0, loading=0.0, detail=60_000,
+            **options):
+    """The plan, notices and seconds before the first step of a run whose parts take so long."""
+    clock, notices = FakeClock(), []
     task = tiny_task(RunConfig(stereo="on"))
-    task = replace(task, train=20 * task.train, stereo=Slow())
+    task = replace(task, train=20 * task.train, stereo=clock.photos(surfaces))
     scene = SimpleNamespace(
         train=(), validation=(), points=np.zeros((9000, 3)), colors=np.zeros((9000, 3), np.uint8))
+
+    def load(*_):
+        clock.now += loading
+        return task
+
+    def choose(*_, deadline, **__):
+        decisions = []
+        for name in ("exposure", "vignette"):
+            try:
+                deadline.refuse_late(trials / 2)
+                clock.now += trials / 2
+            except OutOfTime:
+                decisions.append(skip_trial(name, NO_TIME))
+        return Needs(RunConfig(stereo="on", exposure="off", vignette="off"), tuple(decisions))
+
+    def measure(*_):
+        clock.now += COST.seconds
+        return COST
+
     for name, value in {
-            "gaussians_that_fit": 10**9, "load_task": task, "count_detail": 16_000,
-            "choose_parts": Needs(RunConfig(stereo="on"), ()), "_measure_cost": COST}.items():
-        monkeypatch.setattr(plan, name, lambda *_, value=value, **__: value)
-    monkeypatch.setattr(plan, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-    ctx = SimpleNamespace(notice=lambda _: None)
+            "gaussians_that_fit": lambda *_: 10**9, "load_task": load, "choose_parts": choose,
+            "count_detail": lambda _: detail, "_measure_cost": measure,
+            "Deadline": partial(Deadline, clock=clock)}.items():
+        monkeypatch.setattr(plan, name, value)
+    ctx = SimpleNamespace(notice=notices.append)
+    plan.plan_task(TrainConfig(minutes=minutes, **options), scene, tmp_path, ctx)
+    return TrainPlan.read(tmp_path), notices, clock.now
+
+
+def test_minutes_include_a_search_for_surfaces_that_only_the_longer_run_has_room_for(
+        tmp_path, monkeypatch):
     likely = plan.probe_config(TrainConfig(minutes=5.0), Facts(16_000, 80, 9000, 10**9))
     assert likely.max_gaussians // 2 < 9000  # all of it sparse points
-    plan.plan_task(TrainConfig(minutes=5.0), scene, tmp_path, ctx)
-    assert now[0] == 20
-    assert 270 < TrainPlan.read(tmp_path).seconds <= 300 - COST.seconds - 20
+    made, notices, before = planned(
+        tmp_path, monkeypatch, minutes=5.0, surfaces=20.0, detail=16_000)
+    assert before == pytest.approx(20 + COST.seconds)
+    assert 270 < made.seconds <= 300 - before
+    assert notices == []
+
+
+@pytest.mark.parametrize("slow", [
+    {"trials": 63.0}, {"surfaces": 23.0}, {"trials": 63.0, "surfaces": 23.0, "loading": 2.0},
+    {"trials": 400.0, "surfaces": 400.0}])
+def test_trials_and_surfaces_take_a_fifth_of_the_minutes_and_steps_at_least_half(
+        tmp_path, monkeypatch, slow):
+    made, notices, before = planned(tmp_path, monkeypatch, minutes=1.0, **slow)
+    one_photo = slow.get("surfaces", 0.0) / 60  # before which it is not cut
+    assert before - slow.get("loading", 0.0) <= 0.2 * 60 + COST.seconds + one_photo
+    assert made.seconds >= 0.5 * 60
+    assert before + made.seconds == pytest.approx(60, rel=0.02)
+    said, = notices
+    assert ("exposure is off, vignette is off" in said) is ("trials" in slow)
+    assert ("stereo is off" in said) is ("surfaces" in slow)
+    assert read_config(tmp_path).stereo == ("off" if "surfaces" in slow else "on")
+
+
+def test_the_part_that_is_asked_for_is_searched_whatever_it_takes(tmp_path, monkeypatch):
+    made, notices, before = planned(
+        tmp_path, monkeypatch, minutes=1.0, surfaces=23.0, stereo="on")
+    assert before > 23
+    assert read_config(tmp_path).stereo == "on"
+    assert made.seconds >= 30
+    assert notices == []
+
+
+def test_half_of_the_minutes_are_steps_even_where_loading_took_the_rest(tmp_path, monkeypatch):
+    made, _, before = planned(tmp_path, monkeypatch, minutes=1.0, loading=50.0)
+    assert before > 50
+    assert made.seconds == pytest.approx(30, rel=0.02)
+
+
+@pytest.mark.parametrize(("minutes", "blurred"), [(0.05, True), (0.2, False)])
+def test_steps_under_a_sixth_of_a_normal_run_are_said_before_the_first(
+        tmp_path, monkeypatch, minutes, blurred):
+    made, notices, _ = planned(tmp_path, monkeypatch, minutes=minutes)
+    assert (made.iterations < 0.15 * QUALITIES["normal"].iterations) is blurred
+    assert any("2,400" in text for text in notices) is blurred
 
 
 def test_a_hundredth_of_a_minute_gives_the_smallest_run():

@@ -101,7 +101,7 @@ def test_they_are_searched_once_and_only_when_asked_for():
     stereo = StereoPoints(
         views_of(AROUND, grain), lambda: asked.append(1) or model(EDGE), NullProgress())
     assert asked == []
-    assert stereo.found is stereo.found
+    assert stereo.search() is stereo.search()
     assert asked == [1]
 
 

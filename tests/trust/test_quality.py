@@ -7,7 +7,12 @@ import summaries
 
 from recon_cli.evaluation.scores import Metrics, ModelMetrics, ViewScore
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
-from recon_cli.trust.quality import describe_quality, find_failed_views, read_quality
+from recon_cli.trust.quality import (
+    describe_quality,
+    find_doubtful_cameras,
+    find_failed_views,
+    read_quality,
+)
 from recon_cli.trust.scene_trust import ModelTrust, TrustRecord
 from recon_cli.trust.surface import SurfaceShares
 from recon_cli.workspace.records import Frame
@@ -86,3 +91,13 @@ def test_views_that_failed_are_those_of_the_model_that_is_exported_the_worst_fir
     assert [view.name for view in find_failed_views(metrics(20.0, 30.0, 18.0))] == [
         "2.png", "0.png"]
     assert find_failed_views(None) == ()
+
+
+@pytest.mark.parametrize(("scores", "doubtful"), [
+    ((19.7, 21.0, 18.2, 20.5, 17.1, 22.0, 23.5), []),  # a short training blurs all views
+    ((30.0, 29.0, 31.0, 16.0, 28.0), ["3.png"]),
+    ((25.0, 24.0, 26.0, 12.0, 15.0, 21.0, 25.5), ["3.png", "4.png"]),
+    ((21.0,), [])])
+def test_cameras_are_in_doubt_where_views_fail_alone_and_not_where_the_model_is_blurred(
+        scores, doubtful):
+    assert [view.name for view in find_doubtful_cameras(metrics(*scores))] == doubtful

@@ -1,17 +1,17 @@
-"""What sparse points show of vignettes and tone curves, before any training.
+"""What sparse points show of vignettes, before any training.
 
 A point has one colour. The logarithm of its brightness in view f at squared distance s from the
 principal point is, by `render.response` to the first order,
 
     l = p + g_f + a s + b s^2 + t_f (1 - exp p)
 
-with the point's own p. All unknowns are solved for together by least squares whose weights fall
-where a point contradicts the others: it is hidden there, or gloss.
+with the point's own p. The tone curve t of a view is an unknown like its gain g, as neither may
+pass for a vignette. All are solved for together by least squares whose weights fall where a point
+contradicts the others: it is hidden there, or gloss.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,65 +27,52 @@ _LEAST_VIEWS = 3  # that a point needs to say anything
 _ROUNDS = 4  # of weights
 _DOUBT = 1.5  # times the median residual, from which weights fall
 _BEND_PRIOR = 0.2  # standard deviation of a bend before the points are asked
-# From which parts are worth a trial. Measured: corners lose .1 and 1% in two rendered rooms, 3 to
-# 10% in four real walks, where a vignette is worth -.08 to .16 dB, and 25 to 65% in three others;
-# bends spread by .03 and .04 in the rooms, by .09 to .51 in eight real captures.
-_FALLS, _CURVED = 0.15, 0.08
+# Loss from which a vignette is worth a trial. Measured: .1 and 1% in two rendered rooms, 3 to 10%
+# in four real walks, where a vignette is worth -.08 to .16 dB, and 25 to 65% in three others.
+_FALLS = 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class PhotometricEvidence:
-    """Vignettes and tone curves as sparse points show them."""
+class VignetteEvidence:
+    """Vignettes as sparse points show them."""
 
-    vignettes: NDArray[np.float64]  # [G, 2] exponents a and b by camera, falling; zeros: none
-    bends: NDArray[np.float64]  # [F] of mean 0
+    exponents: NDArray[np.float64]  # [G, 2] a and b by camera, falling; zeros: none
     corner_loss: float  # share of the light that corners lose, by all views and either half alone
-    bend_spread: float  # standard deviation of the bends in which two halves of the points agree
 
     @staticmethod
-    def nothing(views: Sequence[TrainView]) -> PhotometricEvidence:
+    def nothing(views: Sequence[TrainView]) -> VignetteEvidence:
         """Returns that no view shows anything."""
         groups = camera_groups([view.camera for view in views])
-        return PhotometricEvidence(np.zeros((max(groups) + 1, 2)), np.zeros(len(views)), 0.0, 0.0)
+        return VignetteEvidence(np.zeros((max(groups) + 1, 2)), 0.0)
 
     @property
     def shades(self) -> bool:
         """Whether corners are darker than gloss and occlusion make them."""
         return self.corner_loss > _FALLS
 
-    @property
-    def bends_differ(self) -> bool:
-        """Whether the tone curves of the views differ by more than gloss and occlusion explain."""
-        return self.bend_spread > _CURVED
 
-
-def find_photometry(
+def find_vignettes(
     views: Sequence[TrainView], points: NDArray[np.float64], *, seed: int = 0
-) -> PhotometricEvidence:
-    """Returns the vignette of each camera and the bend of each view from colours of points [P, 3].
-    """
+) -> VignetteEvidence:
+    """Returns the vignette of each camera from the colours of points [P, 3]."""
     points = choose_points(points, seed)
     logs = np.log(np.exp(np.stack([log_colors(view, points) for view in views])).mean(axis=2))
     kept = np.isfinite(logs).sum(axis=0) >= _LEAST_VIEWS
     if not kept.any():
-        return PhotometricEvidence.nothing(views)
+        return VignetteEvidence.nothing(views)
     squares = np.stack([_squares(view, points[kept]) for view in views])
     groups = np.array(camera_groups([view.camera for view in views]))
     logs = logs[:, kept]
-    vignettes, bends = _solve(logs, squares, groups)
-    losses = [_corner_loss(vignettes)] + [
-        _corner_loss(_solve(logs[half], squares[half], groups[half])[0])
+    exponents = _solve(logs, squares, groups)
+    losses = [_corner_loss(exponents)] + [
+        _corner_loss(_solve(logs[half], squares[half], groups[half]))
         for half in (slice(0, None, 2), slice(1, None, 2))]
-    first, second = (_solve(logs[:, half], squares[:, half], groups)[1]
-                     for half in (slice(0, None, 2), slice(1, None, 2)))
-    shared = float(((first - first.mean()) * (second - second.mean())).mean())
-    return PhotometricEvidence(
-        vignettes, bends - bends.mean(), min(losses), math.sqrt(max(0.0, shared)))
+    return VignetteEvidence(exponents, min(losses))
 
 
-def _corner_loss(vignettes: NDArray[np.float64]) -> float:
+def _corner_loss(exponents: NDArray[np.float64]) -> float:
     """Returns the share of the light that is lost in the corners, the mean over the cameras."""
-    return float((1 - np.exp(vignettes.sum(axis=1))).mean())
+    return float((1 - np.exp(exponents.sum(axis=1))).mean())
 
 
 def _squares(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,8 +87,8 @@ def _squares(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64
 
 def _solve(
     logs: NDArray[np.float64], squares: NDArray[np.float64], groups: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns falling exponents [G, 2] and bends [F] from logs [F, P], NaN where not seen."""
+) -> NDArray[np.float64]:
+    """Returns falling exponents [G, 2] from logs [F, P], NaN where not seen."""
     seen = np.isfinite(logs)
     logs = np.where(seen, logs, 0.0)
     # of the point, without the noise of this view
@@ -120,7 +107,7 @@ def _solve(
         size = np.abs(rest)
         usual = _DOUBT * float(np.median(size[seen])) + 1e-9
         weights = np.where(seen, np.maximum(1, size / usual) ** -2.0, 0.0)
-    return np.array([falling(a, b) for a, b in exponents.reshape(-1, 2)]), np.asarray(bends)
+    return np.array([falling(a, b) for a, b in exponents.reshape(-1, 2)])
 
 
 def _normal_equations(
