@@ -1,11 +1,9 @@
-"""The verbs of experiments: `recon bench`, `recon bench train` and `recon study`."""
+"""The verbs of experiments: `recon bench` and `recon study`."""
 
 from __future__ import annotations
 
 import functools
-import re
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +11,10 @@ import click
 from click.core import ParameterSource
 
 from recon_cli.commands import options
-from recon_cli.commands.options import Call, Command, Decorator, Verb, pass_call
+from recon_cli.commands.options import Call, Command, Verb, pass_call
 from recon_cli.config import settings
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.experiments.outputs import OutputFiles
 from recon_cli.progress import TqdmProgress
 
 if TYPE_CHECKING:
@@ -81,41 +78,7 @@ _compute_options = options.stack([
     options.assignments("ingest.frames=200"), options.compute(), options.verbosity])
 
 
-def _output_options(plot: str = "") -> Decorator:
-    """Returns a decorator that adds --out and, where there is one, --plot as `outputs`."""
-    def decorate(function: Command) -> Command:
-        @functools.wraps(function)
-        def collect(
-            *args: Any, json_file: Path | None, plot: Path | None = None, **typed: Any
-        ) -> Any:
-            return function(*args, outputs=OutputFiles(json_file, plot), **typed)
-
-        return options.stack([
-            _option("--out", "json_file", type=_FILE,
-                         help="Write all figures to FILE, as JSON.  [default: nowhere]"),
-            *([_option("--plot", type=_FILE, help=(
-                f"{plot} into a .png or .svg; needs matplotlib.  [default: nowhere]"))]
-              if plot else [])])(collect)
-
-    return decorate
-
-
-class _OldSpelling(Verb):
-    """Takes `--json FILE.json`, as --out was once called: every verb has a --json without FILE."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parses the words after the verb."""
-        words = ["--out" if word == "--json" and after.endswith(".json")
-                 else re.sub(r"^--json=", "--out=", word) for word, after in pairwise([*args, ""])]
-        return super().parse_args(ctx, words)
-
-
-class _BenchGroup(_OldSpelling, click.Group):
-    pass
-
-
-@click.group(
-    "bench", cls=_BenchGroup, invoke_without_command=True, subcommand_metavar="[train ...]")
+@click.command("bench", cls=Verb)
 @_option(
     "--scene", type=click.Choice(["room", "small"]), default="room",
     help="room is 100,000 Gaussians at 640x360, small 10,000 at 320x180.  [default: room]")
@@ -137,76 +100,26 @@ class _BenchGroup(_OldSpelling, click.Group):
 @_option(
     "--quick", is_flag=True,
     help="A tiny scene and few rounds: whether it works, not how fast.  [default: off]")
-@_output_options()
+@_option("--out", type=_FILE,
+         help="Write all figures to FILE, as JSON.  [default: nowhere]")
 @_option(
     "--compare", type=options.PathType(dir_okay=False), metavar="FILE",
     help="Print the ratio of each figure of an earlier --out FILE to this run's.  "
          "[default: none]")
 @options.verbosity
 @pass_call
-@click.pass_context
-def bench(ctx: click.Context, call: Call, /, outputs: OutputFiles, **typed: Any) -> None:
+def bench(call: Call, /, **typed: Any) -> None:
     """Measure the rasterizers: speed and error.
 
     Times every stage on a synthetic room and compares images and gradients with a rasterizer in
-    float64, for every backend. `recon bench train` measures recipes of training instead.
+    float64, for every backend.
     """
-    if ctx.invoked_subcommand is not None:
-        _refuse_own_options(ctx)
-        return
     compute = settings.build(ComputeConfig, call.settings)
     from recon_cli.experiments.rasterizer_benchmark import BenchRequest, run
 
     click.echo(run(
-        BenchRequest(**typed, outputs=outputs, device=compute.device, threads=compute.threads),
+        BenchRequest(**typed, device=compute.device, threads=compute.threads),
         TqdmProgress()).text())
-
-
-def _refuse_own_options(ctx: click.Context) -> None:
-    """Raises UsageError where an option of `recon bench` stands before a subcommand."""
-    for parameter in ctx.command.params:
-        if ctx.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE:
-            raise click.UsageError(
-                f"{parameter.opts[0]} has no effect on {ctx.invoked_subcommand}.", ctx)
-
-
-@click.command("train", cls=_OldSpelling)
-@_scene_options
-@_option(
-    "--recipes", multiple=True, metavar="NAME,...",
-    help="reference, budget, paper, budget-pruned, budget-l1 or budget-degree-1, each with "
-         "options of training if wanted: budget+sh_degree=2.  [default: reference,budget]")
-@_option(
-    "--iterations", type=click.IntRange(min=1), metavar="N",
-    help="Steps of every run.  [default: 3000]")
-@_option(
-    "--seconds", expert=True, type=click.FloatRange(min=0, min_open=True), metavar="X",
-    help="As many steps as fit, by the steps of a short pilot.  [default: --iterations counts]")
-@_option(
-    "--seeds", type=click.IntRange(min=1), default=3, metavar="N",
-    help="Runs of each recipe, with seeds 0 to N - 1.  [default: 3]")
-@_option(
-    "--target-db", "targets_db", expert=True, multiple=True, type=float, metavar="DB",
-    help="PSNR whose time is reported; may be repeated.  [default: what all runs of a scene "
-         "reach]")
-@_output_options("Draw the curves")
-@_compute_options
-@pass_call
-def train(call: Call, /, scenes: SceneOptions, recipes: tuple[str, ...], **typed: Any) -> None:
-    """Measure recipes of training: quality over time.
-
-    Trains every recipe on every SCENE and writes curves of PSNR and SSIM on validation views
-    against seconds, with the count and the size of the .ply.
-    """
-    from recon_cli.experiments.recipe_benchmark import RecipeRequest, run
-    from recon_cli.experiments.variants import parse_recipes
-
-    variants = parse_recipes(recipes or ("reference,budget",))
-    request = RecipeRequest(**scenes.fields(call), **typed, recipes=variants)
-    click.echo(run(request, TqdmProgress()).text())
-
-
-bench.add_command(train)
 
 
 @click.command("study", cls=Verb)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon_cli.errors import ConfigError, InputError
 from recon_cli.machine import install_command
 from recon_cli.workspace import atomic
 
@@ -65,35 +64,6 @@ class Result:
         else:
             logger.warning("%s.svg is not drawn: matplotlib is not installed; run `%s`", name,
                            install_command("plot"))
-
-
-@dataclass(frozen=True)
-class OutputFiles:
-    """The files to write; None for those that are not wanted."""
-
-    json_file: Path | None = None
-    plot: Path | None = None
-
-    def check(self) -> None:
-        """Raises ReconError unless all of them can be written."""
-        for path in (self.json_file, self.plot):
-            if path is not None and not path.absolute().parent.is_dir():
-                raise InputError(
-                    f"The folder of {path} does not exist.", hint=f"mkdir -p {path.parent}")
-        if self.plot is not None and self.plot.suffix.lower() not in (".png", ".svg"):
-            raise ConfigError(
-                f"--plot is {self.plot}, but it must end in .png or .svg.",
-                hint=f"Try --plot {self.plot.with_suffix('.svg').name}.")
-        if self.plot is not None and not _can_draw():
-            raise ConfigError("--plot needs matplotlib, which is not installed.",
-                              hint=f"Run `{install_command('plot')}`.")
-
-    def write(self, result: Result) -> None:
-        """Writes those that are wanted."""
-        if self.json_file is not None:
-            atomic.write_json(self.json_file, result.record)
-        if self.plot is not None and result.draw is not None:
-            result.draw(self.plot)
 
 
 def _can_draw() -> bool:

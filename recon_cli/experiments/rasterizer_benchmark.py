@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from recon_cli import machine
-from recon_cli.errors import ConfigError, FormatError
+from recon_cli.errors import ConfigError, FormatError, InputError
 from recon_cli.evaluation.scores import Table, number, percent
 from recon_cli.experiments.bench_measure import (
     FIGURES,
@@ -25,7 +25,7 @@ from recon_cli.experiments.bench_measure import (
 )
 from recon_cli.experiments.bench_scene import QUICK, SIZES, Accuracy
 from recon_cli.experiments.instruments import examine
-from recon_cli.experiments.outputs import OutputFiles, Result
+from recon_cli.experiments.outputs import Result
 from recon_cli.progress import Progress
 from recon_cli.render import registry
 from recon_cli.workspace import atomic
@@ -49,13 +49,15 @@ class BenchRequest:
     threads: int | None = None  # None for all cores
     rounds: int | None = None  # behind each median; None for the usual number
     quick: bool = False  # a tiny scene and few rounds
-    outputs: OutputFiles = field(default_factory=OutputFiles)
+    out: Path | None = None  # the file of all figures
     compare: Path | None = None  # the figures of an earlier run
 
     def __post_init__(self) -> None:
         if self.size is not None:
             parse_size(self.size)
-        self.outputs.check()
+        if self.out is not None and not self.out.absolute().parent.is_dir():
+            raise InputError(f"The folder of {self.out} does not exist.",
+                             hint=f"mkdir -p {self.out.parent}")
 
     def plan(self) -> BenchPlan:
         """Returns the measurements to make; BackendError if a backend is not available."""
@@ -104,7 +106,8 @@ def run(request: BenchRequest, progress: Progress) -> Result:
     host = examine(plan.threads, plan.device)
     benched = BenchResult(host, plan.rounds, {request.scene: measure(plan, progress)})
     result = Result(benched.record(), head(benched), tables(benched))
-    request.outputs.write(result)
+    if request.out is not None:
+        atomic.write_json(request.out, result.record)
     if old is None:
         return result
     if difference := machine_difference(old, result.record):

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from recon_cli.config.settings import parse_assignment
 from recon_cli.config.stages import PruneConfig, RunConfig
-from recon_cli.errors import ConfigError
 
 _MID = RunConfig().mid  # where `recon train --prune` branches off
 # options that all recipes of a benchmark share, or that have no effect here
@@ -77,38 +75,3 @@ BUDGET = Variant("budget", "ours", {"densify": "budget"}, tries_degree=True)
 BUDGET_PRUNED = Variant(
     "budget-pruned", "ours pruned", {"densify": "budget"},
     MidPrune(_MID, PruneConfig(at="mid")), tries_degree=True)
-KNOWN: dict[str, Variant] = {variant.name: variant for variant in (
-    REFERENCE, PAPER, BUDGET, BUDGET_PRUNED,
-    Variant("budget-l1", "budget-l1", {"densify": "budget", "ssim_weight": 0.0}, tries_degree=True),
-    Variant("budget-degree-1", "budget-degree-1", {"densify": "budget", "sh_degree": 1}))}
-
-
-def parse_recipe(text: str) -> Variant:
-    """Returns the variant of `NAME` or `NAME+FIELD=VALUE+...`; ConfigError for unknown names."""
-    name, *changes = text.split("+")
-    if name not in KNOWN:
-        raise ConfigError(
-            f"There is no recipe {name!r}.", hint="Known are " + ", ".join(KNOWN) + ".")
-    known, options = KNOWN[name], {}
-    for change in changes:
-        options.update(parse_assignment(f"train.{change}")["train"])
-    if fixed := _SHARED & options.keys():
-        raise ConfigError(
-            f"The recipe {text!r} sets {', '.join(sorted(fixed))}, which all recipes share.",
-            hint="Use --iterations, --seeds and --max-size.")
-    variant = Variant(
-        text, text if changes else known.name, {**known.options, **options}, known.prune,
-        known.tries_degree and "sh_degree" not in options)
-    variant.config(RunConfig(), iterations=1, seed=0)  # refuses values out of range
-    return variant
-
-
-def parse_recipes(texts: Sequence[str]) -> tuple[Variant, ...]:
-    """Returns the variants of comma-separated lists; ConfigError if empty or with duplicates."""
-    words = [word.strip() for text in texts for word in text.split(",") if word.strip()]
-    if not words:
-        raise ConfigError("No recipe was given.", hint="Try --recipes reference,budget.")
-    twice = [word for word in words if words.count(word) > 1]
-    if twice:
-        raise ConfigError(f"The recipe {twice[0]} appears twice.", hint="Remove one of them.")
-    return tuple(parse_recipe(word) for word in words)

@@ -155,7 +155,8 @@ def twice(folder, names, *, placed=True, labels=("left", "right")):
         image.unlink()
     head, _, rest = text_.partition("<chunk")
     chunk = "<chunk" + rest.partition("</document>")[0]
-    second = chunk if placed else re.sub(r"<component .*?</component>", '<component id="0"/>', chunk)
+    second = chunk if placed else re.sub(
+        r"<component .*?</component>", '<component id="0"/>', chunk)
     (folder / "c.xml").write_text(
         head + chunk.replace('label="a"', f'label="{labels[0]}"')
         + second.replace('label="a"', f'label="{labels[1]}"') + "</document>")

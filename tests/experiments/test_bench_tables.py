@@ -191,16 +191,14 @@ def test_the_model_of_the_cpu_is_read_from_cpuinfo(tmp_path: Path) -> None:
     assert cpu_model(tmp_path / "none")
 
 
-def test_without_matplotlib_the_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_matplotlib_the_figures_are_kept_and_the_extra_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture,
+) -> None:
     monkeypatch.setattr(outputs.importlib.util, "find_spec", lambda _name: None)
-    with pytest.raises(ConfigError) as caught:
-        OutputFiles(plot=Path("front.svg")).check()
-    assert install_command("plot") in caught.value.hint
-
-
-def test_a_picture_of_another_format_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"\.png or \.svg"):
-        OutputFiles(plot=Path("front.pdf")).check()
+    with caplog.at_level("WARNING", "recon"):
+        Result({"a": 1}, "", (), draw=lambda _path: pytest.fail("drawn")).save(tmp_path, "study")
+    assert (tmp_path / "study.json").is_file()
+    assert install_command("plot") in caplog.text
 
 
 # ---- what is asked ----
@@ -225,4 +223,4 @@ def test_quick_takes_fewer_rounds_unless_told() -> None:
 
 def test_an_output_needs_its_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        request(outputs=OutputFiles(tmp_path / "none" / "a.json"))
+        request(out=tmp_path / "none" / "a.json")

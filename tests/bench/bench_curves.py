@@ -1,21 +1,26 @@
-"""`recon bench train`: curves of quality over time for recipes of training."""
+"""Trains recipes on scenes and prints curves of quality over time: `python bench_curves.py --help`.
+
+SCENES are workspaces with cameras, or data sets with poses. Each recipe is trained with several
+seeds and scored on validation views along the way, for equal steps or equal seconds.
+"""
 
 from __future__ import annotations
 
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
-from recon_cli.config.stages import RunConfig
-from recon_cli.errors import ConfigError
+from recon_cli.config.settings import build, parse_assignment
+from recon_cli.config.stages import ComputeConfig, RunConfig
 from recon_cli.evaluation.scores import Table
 from recon_cli.experiments.instruments import Host, Timing
-from recon_cli.experiments.outputs import OutputFiles, Result, add_legend, drawing
+from recon_cli.experiments.outputs import Result, add_legend, drawing
 from recon_cli.experiments.runner import (
     FIGURES,
     STEPS,
@@ -23,12 +28,23 @@ from recon_cli.experiments.runner import (
     ExperimentRequest,
     Runner,
     SceneRuns,
+    base_config,
     shared_options,
 )
 from recon_cli.experiments.scenes import LoadedScene, check_scenes
-from recon_cli.experiments.variants import Variant
-from recon_cli.progress import Progress
+from recon_cli.experiments.variants import (
+    BUDGET,
+    BUDGET_PRUNED,
+    PAPER,
+    REFERENCE,
+    Variant,
+)
+from recon_cli.progress import Progress, TqdmProgress
 
+KNOWN = {variant.name: variant for variant in (
+    REFERENCE, PAPER, BUDGET, BUDGET_PRUNED,
+    Variant("budget-l1", "budget-l1", {"densify": "budget", "ssim_weight": 0.0}, tries_degree=True),
+    Variant("budget-degree-1", "budget-degree-1", {"densify": "budget", "sh_degree": 1}))}
 ALL = "all"  # the only comparison
 _SCORES = 20  # along a run: each is of all validation views
 _INCH = 3.2  # of a panel
@@ -41,24 +57,17 @@ _CLOCKS = ("seconds", "cpu_seconds")
 
 @dataclass(frozen=True, kw_only=True)
 class RecipeRequest(ExperimentRequest):
-    """The options of `recon bench train`; an output that cannot be written is a ReconError."""
+    """The options of a run."""
 
     recipes: tuple[Variant, ...]
-    iterations: int | None = None  # of every run; None where seconds or neither are given
+    iterations: int = STEPS  # of every run
     seconds: float | None = None  # of every run instead
     targets_db: tuple[float, ...] = ()  # PSNR to reach; empty for that of all runs
-    outputs: OutputFiles = field(default_factory=OutputFiles)
-
-    def __post_init__(self) -> None:
-        if self.iterations is not None and self.seconds is not None:
-            raise ConfigError(
-                "--iterations and --seconds exclude each other.", hint="Leave one out.")
-        self.outputs.check()
 
     def steps(self, seconds_per_step: float) -> int:
         """Returns the steps of every run of a recipe."""
         if self.seconds is None:
-            return self.iterations or STEPS
+            return self.iterations
         return max(1, round(self.seconds / max(seconds_per_step, 1e-12)))
 
 
@@ -100,7 +109,7 @@ class CurvesResult:
 
 
 def run(request: RecipeRequest, progress: Progress) -> Result:
-    """Trains every recipe, writes the files, and returns the result."""
+    """Trains every recipe and returns the result."""
     paths = check_scenes(request.scenes)
     runner = Runner(request.base, progress)
     with tempfile.TemporaryDirectory(prefix="recon-bench-") as scratch:
@@ -108,10 +117,8 @@ def run(request: RecipeRequest, progress: Progress) -> Result:
         curves = CurvesResult(
             host, request.seeds, request.base, request.targets_db, request.recipes,
             {loaded.folders.name: measure(loaded, request, runner) for loaded in list(loading)})
-    result = Result(
+    return Result(
         curves.record(), head(curves), tables(curves), draw=lambda path: draw(curves, path))
-    request.outputs.write(result)
-    return result
 
 
 def measure(loaded: LoadedScene, request: RecipeRequest, runner: Runner) -> SceneRuns:
@@ -205,3 +212,42 @@ def draw(result: CurvesResult, path: Path) -> None:
             line[0].set_title(name, fontsize=10)
         add_legend(figure, panels[0][0])
         figure.suptitle(f"{result.host.cpu}, threads: {result.host.threads}", fontsize=9)
+
+
+def parse_recipe(text: str) -> Variant:
+    """Returns the variant of `NAME` or `NAME+FIELD=VALUE+...`."""
+    name, *changes = text.split("+")
+    options: dict[str, Any] = {}
+    for change in changes:
+        options.update(parse_assignment(f"train.{change}")["train"])
+    known = KNOWN[name]
+    return Variant(text, text if changes else known.name, {**known.options, **options}, known.prune,
+                   known.tries_degree and "sh_degree" not in options)
+
+
+@click.command()
+@click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True))
+@click.option("--recipes", default="reference,budget", show_default=True,
+              help=f"Of {', '.join(KNOWN)}; with changed options: budget+sh_degree=2.")
+@click.option("--iterations", type=int, default=STEPS, show_default=True)
+@click.option("--seconds", type=float, help="As many steps as fit, by a short pilot.")
+@click.option("--seeds", type=int, default=3, show_default=True)
+@click.option("--target-db", "targets_db", multiple=True, type=float)
+@click.option("--max-size", type=int, default=600, show_default=True)
+@click.option("--max-gaussians", type=int, default=60_000, show_default=True)
+@click.option("--threads", type=int)
+@click.option("--plot", type=click.Path(path_type=Path), help="A .png or .svg.")
+def main(scenes, recipes, max_size, max_gaussians, threads, plot, **typed) -> None:
+    """Prints the curves of RECIPES on SCENES."""
+    result = run(RecipeRequest(
+        **typed, scenes=scenes, settings={}, compute=build(ComputeConfig, {
+            "compute": {} if threads is None else {"threads": threads}}),
+        base=base_config({}, max_size=max_size, max_gaussians=max_gaussians),
+        recipes=tuple(map(parse_recipe, recipes.split(",")))), TqdmProgress())
+    click.echo(result.text())
+    if plot is not None:
+        result.draw(plot)
+
+
+if __name__ == "__main__":
+    main()
