@@ -21,7 +21,7 @@ from recon_cli.experiments.bench_measure import (
 )
 from recon_cli.experiments.bench_scene import Accuracy
 from recon_cli.experiments.instruments import Host, Timing, alternate
-from recon_cli.experiments.outputs import OutputFiles
+from recon_cli.experiments.outputs import Result
 from recon_cli.experiments.rasterizer_benchmark import (
     BenchRequest,
     check_comparable,
