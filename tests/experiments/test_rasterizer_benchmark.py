@@ -60,8 +60,6 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     (["--compare", "none.json"], 3, "cannot be read"),
     (["--compare", "other.json"], 3, "has the schema none"),
     (["--out", "none/a"], 3, "does not exist"),
-    (["--json", "none/a.json"], 3, "does not exist"),  # as it was once called
-    (["--json=none/a.json"], 3, "does not exist"),
     (["--rounds", "0"], 2, "--rounds"),
 ])
 def test_what_cannot_be_done_is_refused_before_anything_is_measured(
