@@ -199,12 +199,12 @@ def render_frames(request: RenderRequest, job: Job) -> str:
             write_picture(files[0] if files else frames.frame_path(
                 VIDEO_FRAMES[frames.outputs[0]], frames.names[0]), request.out_file)
         files = [request.out_file]
-    kept = request.out_file is not None
+    if request.out_file is not None:
+        logger.info("%s of frames stay in %s to continue from; `recon clean --renders` frees them",
+                    format_megabytes(layout.size_of(frames.root)), frames.root)
     return "\n".join([
         f"{format_count(len(frames.names), 'frame')} in {frames.root}, {len(missing)} of them "
-        "rendered now" + f"; {format_megabytes(layout.size_of(frames.root))} are kept to continue "
-        "from, `recon clean --renders` frees them" * kept,
-        *map(str, files)])
+        "rendered now", *map(str, files)])
 
 
 def _check(request: RenderRequest, plan: CameraPlan) -> VideoEncoding | None:

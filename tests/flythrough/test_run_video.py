@@ -91,15 +91,15 @@ def test_a_view_is_a_picture_of_the_kind_that_its_name_says(room, tmp_path):
 
 def test_frames_that_stay_are_named_with_their_size_and_can_be_cleaned(copied, tmp_path, capsys):
     assert render(copied, *SHORT, "--out", tmp_path / "walk.mp4") == 0
-    assert "`recon clean --renders" in capsys.readouterr().out
+    assert f"`recon clean --renders -w {copied}`" in capsys.readouterr().err
     assert main(["status", "-w", str(copied)]) == 0
-    folder, = (copied / "render").iterdir()
-    assert f"render/{folder.name}" in capsys.readouterr().err
+    folder = copied / "render" / "training-rgb"
+    assert "render/training-rgb" in capsys.readouterr().err
     assert main(["clean", "-w", str(copied)]) == 0
     assert "`recon clean --renders" in capsys.readouterr().err
     assert folder.exists()
     assert main(["clean", "--renders", "-w", str(copied)]) == 0
-    assert f"render/{folder.name}: " in capsys.readouterr().out
+    assert "render/training-rgb: " in capsys.readouterr().out
     assert not folder.exists()
     assert (tmp_path / "walk.mp4").exists()
     assert main(["clean", "train", "--renders", "-w", str(copied)]) == 2
