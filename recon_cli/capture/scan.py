@@ -238,7 +238,7 @@ def _measure(
 
 def _frame_rate(measures: Sequence[_FrameMeasures]) -> float:
     """Returns the mean frames per second, 0 where times are unknown."""
-    # Not of the first and the last: where clips were joined, a decoder may give some in disorder.
+    # Not of the first and the last frame: some programs number packets, B-frames and all.
     times = [frame.seconds for frame in measures if frame.seconds is not None]
     if len(times) < len(measures) or max(times) <= min(times):
         return 0.0
