@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from recon_cli.capture.frame_selection import MIN_FRAMES
-from recon_cli.capture.images import BROKEN, Photo, open_image
+from recon_cli.capture.images import Photo, open_image
+from recon_cli.capture.unreadable import BROKEN
 from recon_cli.capture.xmp import PanoramaArea
 from recon_cli.errors import InputError, list_names
 

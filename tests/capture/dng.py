@@ -35,6 +35,7 @@ class Shot:
         orientation: as EXIF counts.
         model: name of the camera.
         more: other tags with opaque values, by tag.
+        compression: as it is named, though the pixels have none.
         demosaiced: whether the colours of all pixels are stored instead of a mosaic.
     """
 
@@ -47,6 +48,7 @@ class Shot:
     orientation: int = 1
     model: str = "Mosaic One"
     more: Mapping[int, bytes] = field(default_factory=dict)
+    compression: int = 1
     demosaiced: bool = False
 
 
@@ -79,7 +81,7 @@ def write_shot(path: Path, light: NDArray[np.float64], shot: Shot) -> Path:
     planes = 3 if shot.demosaiced else 1
     main: list[Entry] = [
         (254, LONG, [0]), (256, LONG, [width]), (257, LONG, [height]), (258, SHORT, [16] * planes),
-        (259, SHORT, [1]), (262, SHORT, [34892 if shot.demosaiced else 32803]),
+        (259, SHORT, [shot.compression]), (262, SHORT, [34892 if shot.demosaiced else 32803]),
         (271, ASCII, "Test"), (272, ASCII, shot.model), (273, LONG, [8]),
         (274, SHORT, [shot.orientation]), (277, SHORT, [planes]), (278, LONG, [height]),
         (279, LONG, [len(pixels)]), (50706, BYTE, [1, 4, 0, 0]), (50707, BYTE, [1, 1, 0, 0]),
