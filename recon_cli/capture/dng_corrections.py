@@ -146,15 +146,18 @@ def describe_corrections(corrections: Sequence[Corrections]) -> list[str]:
     shaded = [one for one in corrections if one.gains]
     if shaded:
         most = max(float(gain.gains.max()) for one in shaded for gain in one.gains)
-        notices.append(f"The lens shading of {len(shaded)} DNG files is corrected as they say, "
-                       f"by gains up to {most:.2f}.")
+        notices.append(f"The lens shading of {_count(len(shaded))} is corrected as DNG says, by "
+                       f"gains up to {most:.2f}.")
     if warped := sum(one.warp is not None for one in corrections):
-        notices.append(f"The lens distortion of {warped} DNG files is corrected as they say.")
+        notices.append(f"The lens distortion of {_count(warped)} is corrected as DNG says.")
     for name, count in Counter(name for one in corrections for name in one.left_out).items():
-        notices.append(f"{count} DNG files ask for {name}, which is not applied: brightness or "
-                       "geometry may be off. Adobe DNG Converter or the camera's own program can "
-                       "develop them as TIFF.")
+        notices.append(f"A correction of {_count(count)} is not applied ({name}): brightness or "
+                       "geometry may be off. The camera's program can save the photos as TIFF.")
     return notices
+
+
+def _count(photos: int) -> str:
+    return f"{photos} RAW photo{'s' * (photos != 1)}"
 
 
 def _collect(tags: Mapping[int, Any]) -> Corrections:

@@ -74,7 +74,8 @@ def ingest(
     photos = _drop_raw_twins(folder.photos, plan, ctx)
     white = _find_white(photos, ctx)
     for coding, count in Counter(photo.coding for photo in photos if photo.coding).items():
-        ctx.notice(f"{count} photos are {coding.words}: converted to sRGB as video is.")
+        ctx.notice(f"{count} {'photos are' if count > 1 else 'photo is'} {coding.words}: "
+                   "converted to sRGB as video is.")
     sequence, strangers = None, list[str]()
     if not folder.panoramas:
         photos, sequence, strangers = _find_sequence(

@@ -21,22 +21,19 @@ import numpy as np
 import pillow_heif
 import rawpy
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 
 from recon_cli.capture.colour_profile import Coding, convert_coding, read_coding, to_srgb
 from recon_cli.capture.exif import ExifLens, read_exposure, read_lens
 from recon_cli.capture.tiff import (
     BITS,
-    COMPRESSION,
-    JPEG_XL,
     LENGTH,
     WIDTH,
     UnsupportedError,
-    describe,
     is_misread,
-    read_directories,
     read_tiff,
 )
+from recon_cli.capture.unreadable import BROKEN, DAMAGED, unreadable_error
 from recon_cli.capture.xmp import PanoramaArea, is_panorama, panorama_area, read_xmp
 from recon_cli.errors import InputError
 from recon_cli.io.images import decode_file, fit_size
@@ -53,10 +50,6 @@ ANIMATED = frozenset({"WEBP", "PNG", "AVIF", "HEIF"})  # those that may hold a f
 PHOTO_SUFFIXES = RAW_SUFFIXES | {
     ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".jxl", ".pgm",
     ".png", ".ppm", ".tif", ".tiff", ".webp"}
-# What Pillow and pillow_heif raise on damaged files; OSError includes unidentified ones.
-BROKEN = (
-    OSError, SyntaxError, ValueError, EOFError, IndexError, OverflowError, struct.error,
-    RuntimeError)
 # What undoes each orientation of EXIF 2.32, section 4.6.4; 1 is upright.
 TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180,
@@ -72,9 +65,6 @@ PIXEL_BYTES, WIDE_PIXEL_BYTES = 20, 32
 # JPEG 2000, ITU-T T.800, A.5.1: how a code stream starts, and the place of the first component's
 # depth behind, one of three bytes each; the number of components lies before it.
 CODE_STREAM, COMPONENTS, DEPTHS = b"\xff\x4f\xff\x51", 40, 42
-JXL_STARTS = (b"\xff\x0a", b"\x00\x00\x00\x0cJXL \r\n\x87\n")
-DAMAGED = "Copy it from the camera again, or leave it out."
-OTHERWISE = "It is not damaged: save it as JPEG, or PNG of 8 or 16 bits, or leave it out."
 
 WHITE = 65535
 GRAY_SIZE = 960  # pixels of the longer side, at least, at which measures are taken
@@ -271,48 +261,6 @@ def open_image(path: Path) -> Iterator[Image.Image]:
                 f"of memory, and {free / 1e9:.1f} GB are free.",
                 hint="Close other programs, or reduce it: a side of 4000 pixels is plenty.")
         yield image
-
-
-def unreadable_error(path: Path, error: Exception) -> InputError:
-    """Returns the error for a picture that a library does not read."""
-    reason, hint = _describe_coding(path, error)
-    if not reason:
-        reason, hint = _reason(path, error), (
-            OTHERWISE if isinstance(error, UnsupportedError) else DAMAGED)
-    return InputError(f"{path.name} cannot be read: {reason}.", hint=hint)
-
-
-def _describe_coding(path: Path, error: Exception) -> tuple[str, str]:
-    """Returns why no library knows a picture that is not damaged, and a hint; else ""."""
-    with suppress(*BROKEN):
-        if isinstance(error, rawpy.LibRawFileUnsupportedError) and any(
-                tags.get(COMPRESSION) == JPEG_XL for tags in read_directories(path)):
-            return ("its pixels are compressed by JPEG XL, which LibRaw does not decode",
-                    "It is not damaged: let the camera or Adobe DNG Converter write DNG without "
-                    "JPEG XL, or save it as JPEG or TIFF.")
-        if isinstance(error, UnidentifiedImageError):
-            with path.open("rb") as file:
-                head = file.read(16)
-            if head.startswith(JXL_STARTS):
-                return ("JPEG XL needs the package pillow-jxl-plugin",
-                        "Install it beside recon (python -m pip install pillow-jxl-plugin), or "
-                        "convert the photos: djxl photo.jxl photo.png")
-            if tags := next(iter(read_directories(path)), None):
-                return describe(tags), OTHERWISE
-    return "", ""
-
-
-def _reason(path: Path, error: Exception) -> str:
-    """Returns the message of a library, or a plainer one for common cases."""
-    if path.is_file() and path.stat().st_size == 0:
-        return "it is empty (0 bytes)"
-    if isinstance(error, UnidentifiedImageError):
-        return "it is not a picture of a known format"
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    words = error.args[0] if error.args else type(error).__name__
-    text = words.decode(errors="replace") if isinstance(words, bytes) else str(words)
-    return text.split(" (")[0] if text.startswith("image file is truncated") else text.rstrip(".")
 
 
 @cache

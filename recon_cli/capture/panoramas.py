@@ -18,8 +18,9 @@ from PIL import Image
 
 from recon_cli.capture.decoded_picture import Packing
 from recon_cli.capture.frame_selection import MIN_FRAMES
-from recon_cli.capture.images import BROKEN, Photo, open_image
+from recon_cli.capture.images import Photo, open_image
 from recon_cli.capture.two_views import find_two_views, has_two_circles
+from recon_cli.capture.unreadable import BROKEN
 from recon_cli.capture.xmp import PanoramaArea
 from recon_cli.errors import InputError, list_names
 from recon_cli.io.views import evenly_spread

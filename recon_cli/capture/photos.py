@@ -51,7 +51,7 @@ def list_photos(paths: Iterable[Path], home: Path | None = None) -> PhotoFolder:
             photos.append(inspect_photo(path, label))
         except InputError as error:
             if path.suffix.lower() in PHOTO_SUFFIXES:
-                broken[label] = error.message
+                broken[label] = f"{error.message} {error.hint}".rstrip()
     return PhotoFolder(tuple(photos), broken)
 
 
@@ -152,7 +152,7 @@ def check_count(folder: Path, photos: Sequence[Photo], broken: dict[str, str]) -
     raise InputError(
         f"{folder} holds {count} that can be used and {len(broken)} that cannot, but "
         f"at least {MIN_FRAMES} are needed. The first: {next(iter(broken.values()))}",
-        hint="Fix the files listed above, or copy the photos from the camera again.")
+        hint="Mend, convert or replace the files listed above.")
 
 
 def _count_hint(folder: Path) -> str:

@@ -21,8 +21,9 @@ import rawpy
 from numpy.typing import NDArray
 
 from recon_cli.capture.dng_corrections import Warp, correct_shading, read_corrections, turn
-from recon_cli.capture.images import Photo, check_size, open_raw, unreadable_error
+from recon_cli.capture.images import Photo, check_size, open_raw
 from recon_cli.capture.raw_exposure import RawMeasures, exposures, measure_view, nominal_ev
+from recon_cli.capture.unreadable import unreadable_error
 from recon_cli.errors import InputError
 from recon_cli.workspace.summaries import JsonRecord
 
@@ -106,8 +107,7 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     """Returns a RAW photo as upright sRGB, [H, W, 3]; InputError if it is, or was, damaged."""
     shot = plan.shots.get(photo.name)
     if shot is None:
-        raise InputError(
-            plan.broken[photo.name], hint="Copy it from the camera again, or leave it out.")
+        raise InputError(plan.broken[photo.name])
     try:
         with _open_corrected(photo.path) as (raw, warp):
             flip = raw.sizes.flip
@@ -146,9 +146,10 @@ def _try_read(
     try:
         return read(path)
     except InputError as error:
-        broken[name] = error.message
+        reason = error
     except rawpy.LibRawError as error:
-        broken[name] = unreadable_error(path, error).message
+        reason = unreadable_error(path, error)
+    broken[name] = f"{reason.message} {reason.hint}"
     return None
 
 

@@ -17,6 +17,9 @@ SRGB_OF_XYZ = np.array([
     [3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 RESPONSE = (0.5, 1.0, 0.625)  # of the sensor's red, green and blue to white light
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
+BEFORE, AFTER = 51009, 51022  # tags of the opcodes before and after demosaicing
+GAIN_MAP = 9
+SIZE = 96, 144  # height and width of a picture with a map of gains
 SIZES = {BYTE: "B", SHORT: "H", LONG: "I"}
 Entry = tuple[int, int, object]  # tag, type, values
 
@@ -35,6 +38,7 @@ class Shot:
         orientation: as EXIF counts.
         model: name of the camera.
         more: other tags with opaque values, by tag.
+        compression: as it is named, though the pixels have none.
         demosaiced: whether the colours of all pixels are stored instead of a mosaic.
     """
 
@@ -47,6 +51,7 @@ class Shot:
     orientation: int = 1
     model: str = "Mosaic One"
     more: Mapping[int, bytes] = field(default_factory=dict)
+    compression: int = 1
     demosaiced: bool = False
 
 
@@ -79,7 +84,7 @@ def write_shot(path: Path, light: NDArray[np.float64], shot: Shot) -> Path:
     planes = 3 if shot.demosaiced else 1
     main: list[Entry] = [
         (254, LONG, [0]), (256, LONG, [width]), (257, LONG, [height]), (258, SHORT, [16] * planes),
-        (259, SHORT, [1]), (262, SHORT, [34892 if shot.demosaiced else 32803]),
+        (259, SHORT, [shot.compression]), (262, SHORT, [34892 if shot.demosaiced else 32803]),
         (271, ASCII, "Test"), (272, ASCII, shot.model), (273, LONG, [8]),
         (274, SHORT, [shot.orientation]), (277, SHORT, [planes]), (278, LONG, [height]),
         (279, LONG, [len(pixels)]), (50706, BYTE, [1, 4, 0, 0]), (50707, BYTE, [1, 1, 0, 0]),
@@ -102,6 +107,22 @@ def write_shot(path: Path, light: NDArray[np.float64], shot: Shot) -> Path:
     start = 8 + len(body)
     path.write_bytes(b"II*\0" + struct.pack("<I", start) + body + _directory(main, start))
     return path
+
+
+def opcodes(*items: tuple[int, bytes]) -> bytes:
+    """Returns a list of opcodes and their parameters; big-endian in any file."""
+    data = struct.pack(">I", len(items))
+    for code, parameters in items:
+        data += struct.pack(">4I", code, 0x01030000, 0, len(parameters)) + parameters
+    return data
+
+
+def gain_map(gains, *, first=(0, 0), pitch=(1, 1), plane=0, planes=1, size=SIZE):
+    """Returns the opcode of gains [V, H, P] in a grid over the picture, from edge to edge."""
+    down, across, parts = gains.shape
+    return GAIN_MAP, struct.pack(
+        ">10I4dI", *first, *size, plane, planes, *pitch, down, across, 1 / (down - 1),
+        1 / (across - 1), 0, 0, parts) + gains.astype(">f4").tobytes()
 
 
 def _directory(entries: list[Entry], start: int) -> bytes:

@@ -4,33 +4,16 @@ import struct
 
 import numpy as np
 import pytest
-from dng import Shot, linear, write_shot
+from dng import AFTER, BEFORE, SIZE, Shot, gain_map, linear, opcodes, write_shot
 
 from recon_cli.capture.dng_corrections import describe_corrections, read_corrections
 from recon_cli.capture.images import inspect_photo
 from recon_cli.capture.raw import develop, plan_raw
 
-BEFORE, AFTER = 51009, 51022  # tags of the lists before and after demosaicing
-WARP, VIGNETTE, GAIN_MAP, WARP_2 = 1, 3, 9, 14
-H, W = 96, 144
+WARP, VIGNETTE, WARP_2 = 1, 3, 14
+H, W = SIZE
 FLAT = 0.3  # light of a wall
 STEP = 0.02  # of a share: steps of 8 bits around `FLAT`, and rounding of 14
-
-
-def opcodes(*items):
-    """A list of opcodes, (code, parameters) each; big-endian in any file."""
-    data = struct.pack(">I", len(items))
-    for code, parameters in items:
-        data += struct.pack(">4I", code, 0x01030000, 0, len(parameters)) + parameters
-    return data
-
-
-def gain_map(gains, *, first=(0, 0), pitch=(1, 1), plane=0, planes=1):
-    """Gains [V, H, P] in a grid over the picture, from edge to edge."""
-    down, across, parts = gains.shape
-    return GAIN_MAP, struct.pack(
-        ">10I4dI", *first, H, W, plane, planes, *pitch, down, across, 1 / (down - 1),
-        1 / (across - 1), 0, 0, parts) + gains.astype(">f4").tobytes()
 
 
 def bilinear(corners):

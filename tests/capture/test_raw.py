@@ -8,6 +8,7 @@ from dng import Shot, linear, write_shot
 from media import texture, write_dng
 
 from recon_cli.capture.images import inspect_photo, read_photo
+from recon_cli.capture.photos import list_photos
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
 from recon_cli.errors import InputError
 
@@ -166,6 +167,15 @@ def test_what_cannot_be_developed_is_named_and_the_rest_is_planned(tmp_path):
     assert "half.dng cannot be read" in plan.broken["half.dng"]
     with pytest.raises(InputError, match="only black"):
         develop(inspect_photo(black), plan)
+
+
+def test_a_dng_with_jpeg_xl_inside_is_not_taken_for_damaged(tmp_path):
+    path = write_shot(tmp_path / "a.dng", scene(), Shot(compression=52546))
+    with pytest.raises(InputError, match="JPEG XL") as error:
+        inspect_photo(path)
+    assert "not damaged" in error.value.hint
+    (reason,) = list_photos([path]).broken.values()
+    assert error.value.hint in reason
 
 
 def test_a_photo_that_breaks_after_the_plan_is_refused(tmp_path):

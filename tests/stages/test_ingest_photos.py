@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from dng import Shot, linear, write_shot
+from dng import BEFORE, Shot, gain_map, linear, opcodes, write_shot
 from facts import assert_facts
 from ingest_media import blocks, listed, take, walk, write_photos, write_sequence
 from PIL import Image
@@ -165,6 +165,19 @@ def test_raw_photos_are_developed_alike_and_the_gains_are_recorded(tmp_path):
         linear(np.asarray(Image.open(tmp_path / "out" / "frames" / name))).mean()
         for name in names]
     assert np.ptp(levels) / np.median(levels) < 0.02
+
+
+def test_colours_and_lenses_that_are_corrected_are_told(tmp_path, notices):
+    folder = write_raw(tmp_path / "room", [0, 0, 0])
+    for path in folder.iterdir():
+        shaded = gain_map(np.full((2, 2, 1), 1.75), size=(96, 128))
+        write_shot(path, linear(blocks(96, 128)) * 0.3, Shot(more={BEFORE: opcodes(shaded)}))
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = 2
+    Image.fromarray(blocks(96, 128, seed=7)).save(folder / "a.jpg", exif=exif)
+    take(folder, tmp_path / "out")
+    told = "\n".join(notices())
+    assert_facts(told, "1 photo", "Adobe RGB", "3 RAW photos", "1.75")
 
 
 def test_a_plan_that_is_there_is_kept_and_gives_the_same_frames(tmp_path, monkeypatch):
