@@ -96,7 +96,8 @@ class ExportConfig(StageConfig):
         "png", "Format of the texture.", choices=("png", "jpg"), per_file=True, expert=True)
     spz_version: int = option(
         3, "Version of .spz: 3 is read by most programs; 2 by older ones, with coarser "
-        "rotations; 4 by PlayCanvas' engine, but not by Spark.", minimum=2, maximum=4, per_file=True, expert=True)
+        "rotations; 4 by PlayCanvas' engine, but not by Spark.", minimum=2, maximum=4,
+        per_file=True, expert=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
