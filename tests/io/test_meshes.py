@@ -13,6 +13,7 @@ import trimesh
 from recon_cli.errors import FormatError
 from recon_cli.io.mesh_data import TINT, joined
 from recon_cli.io.meshes import SUFFIXES, Mesh, Texture, read_mesh, simplify, write_mesh
+from recon_cli.room.files import write_mesh_file
 from recon_cli.splats.glb import Z_UP
 
 pytestmark = pytest.mark.floors
@@ -44,6 +45,16 @@ def test_a_glb_is_in_the_axes_of_gltf(tmp_path):
     primitive = gltf["meshes"][0]["primitives"][0]
     assert {"POSITION", "COLOR_0"} <= primitive["attributes"].keys()
     assert np.allclose(read_mesh(tmp_path / "mesh.glb").vertices, ball().vertices @ Z_UP.T)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [0, 1, 0]])
+def test_up_is_y_in_a_glb_and_an_obj_as_in_the_scene_in_a_ply(tmp_path, suffix, up):
+    mesh, up = ball(), np.array(up, float)
+    path = write_mesh_file(tmp_path / f"mesh.{suffix}", mesh, up)
+    wanted = mesh.vertices @ up  # heights
+    found = read_mesh(path).vertices @ (up if suffix == "ply" else np.array([0, 1, 0]))
+    assert np.allclose(found, wanted, atol=1e-5)
 
 
 def test_a_glb_holds_linear_colours_that_no_light_changes(tmp_path):
