@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -27,32 +28,47 @@ _FITS = 3.0  # points of the same world lie within so many times the extent of t
 _NEAR, _ASKED = 0.1, 2000
 
 
-def list_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Returns the pictures below a folder by names that may be paths elsewhere, or lack a suffix.
+class PhotoFiles:
+    """The pictures below a folder by names that may be paths elsewhere, or lack a suffix.
 
     A name that fits several files, or a file that fits several names, is left out, unless their
     folders tell them apart.
     """
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PICTURES
-                   and path.is_file() and path.name[0] != ".")
-    keys: dict[str, list[Path]] = {}
-    for path in files:
-        for key in {path.name.casefold(), f"/{path.stem.casefold()}"}:
-            keys.setdefault(key, []).append(path)
-    found = {}
-    for name in names:
-        parts = PureWindowsPath(name).parts
-        last = parts[-1] if parts else ""
-        stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
-        fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
-        if len(fitting) > 1:
-            shared = [shared_folders(path.parts[:-1], parts[:-1]) for path in fitting]
-            best = max(shared)
-            fitting = [path for path, count in zip(fitting, shared, strict=True) if count == best]
-        if len(fitting) == 1:
-            found[name] = fitting[0]
-    taken = list(found.values())
-    return {name: path for name, path in found.items() if taken.count(path) == 1}
+
+    def __init__(self, folder: Path, names: Sequence[str], left_out: LeftOut) -> None:
+        self.missing: list[str] = []  # names that were asked for, and that no file has
+        self._left_out = left_out
+        keys: dict[str, list[Path]] = {}
+        for path in sorted(folder.rglob("*")):
+            if path.suffix.lower() in _PICTURES and path.is_file() and path.name[0] != ".":
+                for key in {path.name.casefold(), f"/{path.stem.casefold()}"}:
+                    keys.setdefault(key, []).append(path)
+        self._fitting = {name: _choose(keys, name) for name in names}
+        self._takers = Counter(
+            self._fitting[name][0] for name in names if len(self._fitting[name]) == 1)
+
+    def find(self, name: str) -> Path | None:
+        """Returns the file of a name; None where there is none or not one alone, and counts it."""
+        fitting = self._fitting[name]
+        if not fitting:
+            self.missing.append(PurePosixPath(name).name)
+        elif len(fitting) > 1 or self._takers[fitting[0]] > 1:
+            self._left_out.add(PurePosixPath(name).name, (
+                "whose photos nothing tells apart: several have one name, and no folder of theirs "
+                "is called as in the list"))
+        else:
+            return fitting[0]
+        return None
+
+
+def _choose(keys: Mapping[str, list[Path]], name: str) -> list[Path]:
+    """Returns the files that fit a name, of several those with the most of its folders."""
+    parts = PureWindowsPath(name).parts
+    last = parts[-1] if parts else ""
+    stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
+    fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
+    shared = [shared_folders(path.parts[:-1], parts[:-1]) for path in fitting]
+    return [path for path, count in zip(fitting, shared, strict=True) if count == max(shared)]
 
 
 def solved_set(
@@ -69,7 +85,7 @@ def solved_set(
             hint="Put the photos beside the file of the cameras; or give them alone, so that the "
             f"cameras are found from them: recon ingest {photos}")
     unique = _unique_names(listed, folder)
-    posed = find_images(layout, unique, folder, missing=missing)
+    posed = find_images(layout, unique, folder, missing=list(dict.fromkeys(missing)))
     return replace(posed, notices=(*left_out.notices(), *posed.notices))
 
 
