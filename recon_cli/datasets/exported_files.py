@@ -127,25 +127,29 @@ def find_points(posed: PosedSet, folder: Path) -> PosedSet:
 def read_points(posed: PosedSet, path: Path) -> PosedSet:
     """Returns the set with the points of a .ply, in place of its own; a notice if they do not fit.
 
-    Colours that it lacks are gray. Of very many points some are taken, evenly spread.
+    Of very many points some are taken, evenly spread.
     """
-    # Late, for it imports torch, which nothing else here needs.
-    from recon_cli.splats.ply import read_ply_points
-
     try:
-        points, colors = read_ply_points(path)
+        points, colors = read_cloud(path)
     except (FormatError, InputError) as error:
         return _with_notice(posed, f"{path.name} is not read: {error.message}")
     if not _fits(points, posed):
         return _with_notice(posed, f"{path.name} is not read: its points lie far from the cameras, "
                             "or from the set's own points")
-    if colors is None:
-        colors = np.full(points.shape, 128, np.uint8)
     rows = thin_points(points, MAX_POINTS)
     count = f"{len(points)} points" + f", {len(rows)} of them, evenly spread" * (
         len(rows) < len(points))
     return _with_notice(
         replace(posed, points=points[rows], colors=colors[rows]), f"{path.name} gives {count}")
+
+
+def read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Returns the points [P, 3] of a .ply and their colours, gray where it has none."""
+    # Late, for it imports torch, which nothing else here needs.
+    from recon_cli.splats.ply import read_ply_points
+
+    points, colors = read_ply_points(path)
+    return points, np.full(points.shape, 128, np.uint8) if colors is None else colors
 
 
 def _fits(points: NDArray[np.float64], posed: PosedSet) -> bool:

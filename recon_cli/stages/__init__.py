@@ -63,7 +63,7 @@ class Stage:
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 5, False,
+    Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 6, False,
           "recon_cli.stages.ingest", input_metavar="VIDEO"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 2, True,
           "recon_cli.stages.denoise"),
