@@ -13,8 +13,6 @@ import zlib as zlib
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from recon_cli.errors import BackendError
-
 if TYPE_CHECKING:  # for type checkers; at run time `__getattr__` does the same
     from recon_cli.api import (
         Camera,
@@ -53,7 +51,7 @@ def _check_import_order() -> None:
     order = [name for name in sys.modules if name in ("zlib", "pycolmap._core")]
     if (order == ["pycolmap._core", "zlib"] and sys.platform == "linux"
             and "zlib" not in sys.builtin_module_names):
-        raise BackendError(
+        raise import_module("recon_cli.errors").BackendError(
             "pycolmap was imported before zlib, so that Python aborts when it compresses anything.",
             hint="Import recon_cli, or zlib, before pycolmap.")
 

@@ -23,7 +23,6 @@ from recon_cli.io.calibration import viewmat_from_pose
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace.atomic import read_json, read_text
 
-MILLIMETRE = 1e-3
 Y_UP = (0.0, 1.0, 0.0)  # of ARKit's and Unity's worlds
 Z_UP = (0.0, 0.0, 1.0)
 PICTURES = (".jpg", ".jpeg", ".png")

@@ -16,14 +16,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recon_cli.datasets.app_frames import (
-    MILLIMETRE,
     PICTURES,
     Z_UP,
     LeftOut,
     quoted,
     tracked_set,
 )
-from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.depth_file import lidar_depth
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.datasets.trajectory import Trajectory
 from recon_cli.errors import FormatError, InputError
@@ -73,10 +72,7 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
         if viewmat is None:
             left_out.add(image.name, "without a pose near in time")
             continue
-        file, level = _nearest(depths, time), _nearest(levels, time)
-        confidence = ConfidenceFile(level) if level else None
-        depth = DepthFile(file, MILLIMETRE, lens, confidence=confidence,
-                          reliable=LIDAR_RANGE) if file else None
+        depth = lidar_depth(_nearest(depths, time), _nearest(levels, time), lens)
         listed.append(PosedImage(image.name, image, lens, viewmat, depth=depth, time=time))
     return tracked_set(
         "arkitscenes", listed, folder, left_out, up=Z_UP, photos=quoted(home / kind),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.app_frames import LeftOut, quoted
 from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
-from recon_cli.datasets.exported_files import list_files, solved_set
+from recon_cli.datasets.exported_files import PhotoFiles, solved_set
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import make_lens
@@ -66,17 +66,15 @@ def read_bundler(path: Path) -> PosedSet:
         raise FormatError(
             f"{file} has {cameras} cameras, but {list_file.name} names {len(names)} images.",
             hint="Copy the list that belongs to it.")
-    files = list_files(folder, names)
-    left_out, listed, missing = LeftOut(), [], []
+    left_out, listed = LeftOut(), []
+    files = PhotoFiles(folder, names, left_out)
     for name in names:
         (focal, k1, k2), rows, shift = _take(lines, 3, file), [
             _take(lines, 3, file) for _ in range(3)], _take(lines, 3, file)
-        image = files.get(name)
+        image = None if focal == 0 else files.find(name)
         if focal == 0:
             left_out.add(name, "that Bundler did not place")
-        elif image is None:
-            missing.append(name)
-        else:
+        elif image is not None:
             pose = left_out.pose(image.name, _camera_to_world, rows, shift, opengl=False)
             if pose is not None:
                 width, height = image_size(image)
@@ -85,7 +83,8 @@ def read_bundler(path: Path) -> PosedSet:
                 if not k1 and not k2:
                     lens = make_lens("SIMPLE_PINHOLE", width, height, lens.params[:3], str(file))
                 listed.append(PosedImage(image.name, image, lens, pose))
-    posed = solved_set("bundler", listed, folder, left_out, missing=missing, photos=quoted(folder))
+    posed = solved_set("bundler", listed, folder, left_out, missing=files.missing,
+                       photos=quoted(folder))
     cloud, colors = _read_points(lines, points, file)
     posed = replace(posed, find_up=True)
     return replace(posed, points=cloud, colors=colors) if len(cloud) else posed

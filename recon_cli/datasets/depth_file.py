@@ -19,6 +19,7 @@ from recon_cli.errors import FormatError
 from recon_cli.io.exr import read_exr
 from recon_cli.scene.camera import MODELS, Lens
 
+MILLIMETRE = 1e-3
 LIDAR_RANGE = 5.0  # metres; beyond it, phones' depth is a guess
 LOW, MEDIUM, HIGH = 0, 1, 2  # levels of confidence
 _PACKED = (".depth", ".conf")  # Record3D's, without a header
@@ -121,6 +122,16 @@ class DepthFile:
     def with_lens(self, lens: Lens) -> DepthFile:
         """Returns the depth of the same image with other intrinsics."""
         return replace(self, lens=lens)
+
+
+def lidar_depth(
+    path: Path | None, level: Path | None, lens: Lens, *, high: int = HIGH
+) -> DepthFile | None:
+    """Returns a phone's depth in millimetres, None without a file; `level` is its confidence."""
+    if path is None:
+        return None
+    confidence = ConfidenceFile(level, high) if level else None
+    return DepthFile(path, MILLIMETRE, lens, confidence=confidence, reliable=LIDAR_RANGE)
 
 
 def _read(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, int] | None

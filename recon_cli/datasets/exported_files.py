@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -27,32 +28,47 @@ _FITS = 3.0  # points of the same world lie within so many times the extent of t
 _NEAR, _ASKED = 0.1, 2000
 
 
-def list_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Returns the pictures below a folder by names that may be paths elsewhere, or lack a suffix.
+class PhotoFiles:
+    """The pictures below a folder by names that may be paths elsewhere, or lack a suffix.
 
     A name that fits several files, or a file that fits several names, is left out, unless their
     folders tell them apart.
     """
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PICTURES
-                   and path.is_file() and path.name[0] != ".")
-    keys: dict[str, list[Path]] = {}
-    for path in files:
-        for key in {path.name.casefold(), f"/{path.stem.casefold()}"}:
-            keys.setdefault(key, []).append(path)
-    found = {}
-    for name in names:
-        parts = PureWindowsPath(name).parts
-        last = parts[-1] if parts else ""
-        stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
-        fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
-        if len(fitting) > 1:
-            shared = [shared_folders(path.parts[:-1], parts[:-1]) for path in fitting]
-            best = max(shared)
-            fitting = [path for path, count in zip(fitting, shared, strict=True) if count == best]
-        if len(fitting) == 1:
-            found[name] = fitting[0]
-    taken = list(found.values())
-    return {name: path for name, path in found.items() if taken.count(path) == 1}
+
+    def __init__(self, folder: Path, names: Sequence[str], left_out: LeftOut) -> None:
+        self.missing: list[str] = []  # names that were asked for, and that no file has
+        self._left_out = left_out
+        keys: dict[str, list[Path]] = {}
+        for path in sorted(folder.rglob("*")):
+            if path.suffix.lower() in _PICTURES and path.is_file() and path.name[0] != ".":
+                for key in {path.name.casefold(), f"/{path.stem.casefold()}"}:
+                    keys.setdefault(key, []).append(path)
+        self._fitting = {name: _choose(keys, name) for name in names}
+        self._takers = Counter(
+            self._fitting[name][0] for name in names if len(self._fitting[name]) == 1)
+
+    def find(self, name: str) -> Path | None:
+        """Returns the file of a name; None where there is none or not one alone, and counts it."""
+        fitting = self._fitting[name]
+        if not fitting:
+            self.missing.append(PurePosixPath(name).name)
+        elif len(fitting) > 1 or self._takers[fitting[0]] > 1:
+            self._left_out.add(PurePosixPath(name).name, (
+                "whose photos nothing tells apart: several have one name, and no folder of theirs "
+                "is called as in the list"))
+        else:
+            return fitting[0]
+        return None
+
+
+def _choose(keys: Mapping[str, list[Path]], name: str) -> list[Path]:
+    """Returns the files that fit a name, of several those with the most of its folders."""
+    parts = PureWindowsPath(name).parts
+    last = parts[-1] if parts else ""
+    stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
+    fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
+    shared = [shared_folders(path.parts[:-1], parts[:-1]) for path in fitting]
+    return [path for path, count in zip(fitting, shared, strict=True) if count == max(shared)]
 
 
 def solved_set(
@@ -69,7 +85,7 @@ def solved_set(
             hint="Put the photos beside the file of the cameras; or give them alone, so that the "
             f"cameras are found from them: recon ingest {photos}")
     unique = _unique_names(listed, folder)
-    posed = find_images(layout, unique, folder, missing=missing)
+    posed = find_images(layout, unique, folder, missing=list(dict.fromkeys(missing)))
     return replace(posed, notices=(*left_out.notices(), *posed.notices))
 
 
@@ -111,25 +127,29 @@ def find_points(posed: PosedSet, folder: Path) -> PosedSet:
 def read_points(posed: PosedSet, path: Path) -> PosedSet:
     """Returns the set with the points of a .ply, in place of its own; a notice if they do not fit.
 
-    Colours that it lacks are gray. Of very many points some are taken, evenly spread.
+    Of very many points some are taken, evenly spread.
     """
-    # Late, for it imports torch, which nothing else here needs.
-    from recon_cli.splats.ply import read_ply_points
-
     try:
-        points, colors = read_ply_points(path)
+        points, colors = read_cloud(path)
     except (FormatError, InputError) as error:
         return _with_notice(posed, f"{path.name} is not read: {error.message}")
     if not _fits(points, posed):
         return _with_notice(posed, f"{path.name} is not read: its points lie far from the cameras, "
                             "or from the set's own points")
-    if colors is None:
-        colors = np.full(points.shape, 128, np.uint8)
     rows = thin_points(points, MAX_POINTS)
     count = f"{len(points)} points" + f", {len(rows)} of them, evenly spread" * (
         len(rows) < len(points))
     return _with_notice(
         replace(posed, points=points[rows], colors=colors[rows]), f"{path.name} gives {count}")
+
+
+def read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Returns the points [P, 3] of a .ply and their colours, gray where it has none."""
+    # Late, for it imports torch, which nothing else here needs.
+    from recon_cli.splats.ply import read_ply_points
+
+    points, colors = read_ply_points(path)
+    return points, np.full(points.shape, 128, np.uint8) if colors is None else colors
 
 
 def _fits(points: NDArray[np.float64], posed: PosedSet) -> bool:

@@ -271,11 +271,6 @@ def _without_depth(posed: PosedSet, ctx: IngestContext, reason: str) -> PosedSet
     return replace(posed, images=tuple(replace(image, depth=None) for image in posed.images))
 
 
-def _has_lidar(posed: PosedSet) -> bool:
-    """Returns whether the depth is that of a phone, which is reliable up to a few metres."""
-    return any(image.depth and math.isfinite(image.depth.reliable) for image in posed.images)
-
-
 def _make_known_poses(
     posed: PosedSet, readable: Sequence[tuple[str, PosedImage]], damaged: Collection[Path],
     out: Path, ctx: IngestContext,
@@ -287,14 +282,10 @@ def _make_known_poses(
     if posed.points is not None or not any(image.depth for image in posed.images):
         return poses
     # Views that the set holds out give no depth: it would reveal what they are scored on.
-    if not _has_lidar(posed):
-        rest = tuple(image for image in posed.images
-                     if not image.held_out and image.path not in damaged)
-        points, colors = points_from_depth(replace(posed, images=rest))
-        return replace(poses, points=points, colors=colors)
-    kept = {image.name: image for image in posed.images}
-    rest = tuple(_as_written(kept[image.name], out / store.FOLDER / name)
-                 for name, image in readable if not image.held_out)
+    names = {image.name: name for name, image in readable}
+    rest = tuple(image if image.is_picture else _as_written(image, out / store.FOLDER / names[
+        image.name]) for image in posed.images if not image.held_out and image.path not in damaged
+        and (image.is_picture or image.name in names))
     try:
         points, colors = points_from_depth(replace(posed, images=rest))
     except InputError as error:
@@ -304,9 +295,7 @@ def _make_known_poses(
 
 
 def _as_written(image: PosedImage, path: Path) -> PosedImage:
-    """Returns a frame of a video as the image that was written of it; others stay."""
-    if image.is_picture:
-        return image
+    """Returns a frame of a video as the image that was written of it."""
     lens = image.lens.resized(*image_size(path))
     return replace(image, path=path, lens=lens, depth=image.depth and image.depth.with_lens(lens),
                    frame=None, read=None)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon_cli.datasets.depth_file import DepthFile
+from recon_cli.datasets.depth_file import MILLIMETRE, DepthFile
 from recon_cli.datasets.posed import (
     PosedImage,
     PosedSet,
@@ -33,7 +33,7 @@ from recon_cli.scene.camera import Lens, make_lens
 
 _COLOR = re.compile(r"frame-(\d+)\.color\.(?:png|jpg|jpeg)", re.IGNORECASE)
 _INTRINSICS = "camera-intrinsics.txt"
-_MILLIMETRE, _UNKNOWN = 1e-3, 65535.0
+_UNKNOWN = 65535.0
 # fx, fy, cx, cy of the Kinect at 640x480: nominal for colours, those of the data set for depth.
 _COLOR_KINECT = (525.0, 525.0, 320.0, 240.0)
 _DEPTH_KINECT = (585.0, 585.0, 320.0, 240.0)
@@ -96,7 +96,7 @@ def read_seven_scenes(folder: Path) -> PosedSet:
         if viewmat is None:
             continue
         path = folder / f"{stems[number]}.depth.png"
-        depth = DepthFile(path, _MILLIMETRE, lens, depth_lens, unknown=_UNKNOWN)
+        depth = DepthFile(path, MILLIMETRE, lens, depth_lens, unknown=_UNKNOWN)
         listed.append(PosedImage(
             colors[number].name, colors[number], lens, viewmat,
             depth=depth if path.is_file() else None))

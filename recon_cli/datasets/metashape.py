@@ -9,7 +9,6 @@ nerfstudio's issue 2294.)
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +19,8 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.app_frames import Z_UP, LeftOut, quoted
 from recon_cli.datasets.exported_files import (
+    PhotoFiles,
     find_points,
-    list_files,
     radial_lens,
     shift_far,
     solved_set,
@@ -80,26 +79,22 @@ def read_metashape(path: Path) -> PosedSet:
         worlds |= {(at, key): world for key, world in found.items()}
     left_out, listed, missing = LeftOut(), list[PosedImage](), list[str]()
     for aligned in _by_component(cameras, worlds, left_out):
-        files = list_files(folder, [camera.path for camera in aligned])
-        labels = Counter(camera.label for camera in aligned)
+        files = PhotoFiles(folder, [camera.path for camera in aligned], left_out)
         taken = {image.path for image in listed}
         for camera in aligned:
-            image = files.get(camera.path)
+            image = files.find(camera.path)
             if image in taken:
                 left_out.add(camera.label, "whose photo a larger chunk or component has, too")
-            elif image is None and labels[camera.label] > 1:
-                left_out.add(camera.label, "whose label other cameras have, too: no folder that is "
-                             "called like their chunk or group tells their photos apart")
-            elif image is None:
-                missing.append(camera.label)
-            elif (viewmat := left_out.pose(camera.label, _pose, camera, worlds.get(
-                    camera.component), opengl=False)) is not None:
-                lens = _sensor_lens(camera, left_out)
-                if lens is not None:
+            elif image is not None:
+                viewmat = left_out.pose(
+                    camera.label, _pose, camera, worlds.get(camera.component), opengl=False)
+                lens = None if viewmat is None else _sensor_lens(camera, left_out)
+                if viewmat is not None and lens is not None:
                     listed.append(PosedImage(image.name, image, lens, viewmat))
+        missing += files.missing
     listed.sort(key=lambda image: (image.name, image.path))
     scaled = any(world is not None and world.scale != 1 for world in worlds.values())
-    posed = solved_set("metashape", listed, folder, left_out, missing=list(dict.fromkeys(missing)),
+    posed = solved_set("metashape", listed, folder, left_out, missing=missing,
                        photos=quoted(folder))
     return _finish(posed, folder, scaled)
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.datasets.app_frames import Z_UP, LeftOut, quoted
 from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
-from recon_cli.datasets.exported_files import list_files, radial_lens, shift_far, solved_set
+from recon_cli.datasets.exported_files import PhotoFiles, radial_lens, shift_far, solved_set
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens, make_lens
@@ -61,19 +61,18 @@ def read_opensfm(folder: Path) -> PosedSet:
         value, notices = {}, []
         cameras, shots = read_json(folder / "cameras.json", dict, hint=_HINT), _features(path)
     names = [shot[0] for shot in shots]
-    files, left_out = list_files(folder, names), LeftOut()
-    listed, missing = list[PosedImage](), list[str]()
+    left_out, listed = LeftOut(), list[PosedImage]()
+    files = PhotoFiles(folder, names, left_out)
     for name, camera, turn, position in shots:
-        image = files.get(name)
+        image = files.find(name)
         if image is None:
-            missing.append(name)
             continue
         viewmat = left_out.pose(name, _pose, turn, position, opengl=False)
         lens = None if viewmat is None else _lens(cameras, camera, image, left_out)
         if viewmat is not None and lens is not None:
             listed.append(PosedImage(image.name, image, lens, viewmat))
     listed.sort(key=lambda image: image.name)
-    posed = solved_set("opensfm", listed, folder, left_out, missing=missing,
+    posed = solved_set("opensfm", listed, folder, left_out, missing=files.missing,
                        photos=quoted(folder / "images"))
     points, colors = _read_points(value.get("points") or {})
     posed = replace(posed, up=Z_UP, notices=(*posed.notices, *notices, (

@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.datasets.app_frames import (
-    MILLIMETRE,
     PICTURES,
     LeftOut,
     list_numbered,
     quoted,
     tracked_set,
 )
-from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.depth_file import lidar_depth
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 
@@ -66,9 +65,7 @@ def read_polycam(folder: Path) -> PosedSet:
         image = _list_keyframe(images[number], camera, left_out)
         if image is None:
             continue
-        confidence = ConfidenceFile(levels[number], _HIGH) if number in levels else None
-        depth = DepthFile(depths[number], MILLIMETRE, image.lens, confidence=confidence,
-                          reliable=LIDAR_RANGE) if number in depths else None
+        depth = lidar_depth(depths.get(number), levels.get(number), image.lens, high=_HIGH)
         listed.append(replace(image, depth=depth, rim=_rim(image) if kind else 0))
     posed = tracked_set(
         "polycam", listed, folder, left_out, missing=missing,

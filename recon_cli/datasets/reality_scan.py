@@ -28,8 +28,8 @@ from recon_cli.datasets.app_frames import (
     read_csv,
 )
 from recon_cli.datasets.exported_files import (
+    PhotoFiles,
     find_points,
-    list_files,
     radial_lens,
     shift_far,
     solved_set,
@@ -65,12 +65,11 @@ def read_reality_scan(path: Path) -> PosedSet:
     assert file is not None
     folder = file.parent
     rows = [row for row in read_csv(file, _NEEDED) if row.get("name")]
-    left_out, listed, missing = LeftOut(), [], []
-    files = list_files(folder, [row["name"] for row in rows])
+    left_out, listed = LeftOut(), []
+    files = PhotoFiles(folder, [row["name"] for row in rows], left_out)
     for row in rows:
-        image = files.get(row["name"])
+        image = files.find(row["name"])
         if image is None:
-            missing.append(row["name"])
             continue
         viewmat = left_out.pose(image.name, _pose, row, opengl=True)
         if viewmat is None:
@@ -81,7 +80,7 @@ def read_reality_scan(path: Path) -> PosedSet:
             left_out.add(image.name, "whose intrinsics cannot be used")
             continue
         listed.append(PosedImage(image.name, image, lens, viewmat))
-    posed = solved_set("realityscan", listed, folder, left_out, missing=missing,
+    posed = solved_set("realityscan", listed, folder, left_out, missing=files.missing,
                        photos=quoted(folder))
     posed = replace(posed, up=Z_UP, notices=(*posed.notices, (
         "its unit is a metre only if the project was scaled, which its file does not say; "

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.depth_file import DepthFile
+from recon_cli.datasets.app_frames import PICTURES, list_numbered
+from recon_cli.datasets.depth_file import MILLIMETRE, DepthFile
 from recon_cli.datasets.posed import PosedImage, PosedSet, find_images, image_size
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import lens_from_matrix, viewmat_from_pose
@@ -31,8 +32,6 @@ from recon_cli.workspace.atomic import read_json
 
 _FRAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)")
 _TRAJ, _PARAMS = "traj.txt", "cam_params.json"
-_MILLIMETRE = 1e-3  # ScanNet's depth shift is 1000
-_COLORS = (".jpg", ".jpeg", ".png")
 
 
 def is_replica(folder: Path) -> bool:
@@ -154,14 +153,14 @@ def read_scannet(folder: Path) -> PosedSet:
 
     InputError if no frame has an image and a pose; FormatError if a file is missing or damaged.
     """
-    colors = _list_numbered(folder / "color", _COLORS)
-    poses = _list_numbered(folder / "pose", (".txt",))
+    colors = list_numbered(folder / "color", PICTURES)
+    poses = list_numbered(folder / "pose", (".txt",))
     if not colors or not poses:
         raise InputError(
             f"{folder} has {len(colors)} images in color/ and {len(poses)} poses in pose/.",
             hint="Export both with ScanNet's SensReader.")
     lens = _read_lens(folder, "color", image_size(next(iter(colors.values()))))
-    depths = _list_numbered(folder / "depth", (".png",))
+    depths = list_numbered(folder / "depth", (".png",))
     own = _read_lens(folder, "depth", image_size(next(iter(depths.values())))) if depths else None
     listed, lost = [], 0
     for number, path in colors.items():
@@ -169,7 +168,7 @@ def read_scannet(folder: Path) -> PosedSet:
         if viewmat is None:
             lost += 1
             continue
-        depth = DepthFile(depths[number], _MILLIMETRE, lens, own) if number in depths else None
+        depth = DepthFile(depths[number], MILLIMETRE, lens, own) if number in depths else None
         listed.append(PosedImage(path.name, path, lens, viewmat, depth=depth))
     return tracked_sequence("scannet", listed, folder, lost)
 
@@ -190,14 +189,6 @@ def tracked_sequence(
     if lost:
         notices += (f"{lost} frames whose tracking was lost have no pose and are left out",)
     return replace(posed, metric=True, sequence=True, notices=notices + posed.notices)
-
-
-def _list_numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Returns the files that are named by a number, in its order."""
-    if not folder.is_dir():
-        return {}
-    return dict(sorted((int(path.stem), path) for path in folder.iterdir()
-                       if path.suffix.lower() in suffixes and path.stem.isdecimal()))
 
 
 def _read_lens(folder: Path, kind: str, size: tuple[int, int]) -> Lens:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from recon_cli.datasets.app_frames import (
-    MILLIMETRE,
     PICTURES,
     Z_UP,
     LeftOut,
@@ -30,7 +29,7 @@ from recon_cli.datasets.app_frames import (
     quoted,
     tracked_set,
 )
-from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.depth_file import lidar_depth
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens, make_lens
@@ -129,12 +128,11 @@ def _list_camera(
             image.name, np.matmul, pose, local if base else np.eye(4), opengl=False)
         if viewmat is None:
             continue
-        depth, level = folder / f"{name}_depth" / f"{image.stem}.png", levels.get(image.stem)
+        depth = folder / f"{name}_depth" / f"{image.stem}.png"
         listed.append(PosedImage(
             image.name, image, lens, viewmat, time=float(stem) if "." in stem else None,
-            depth=DepthFile(depth, MILLIMETRE, lens, reliable=LIDAR_RANGE,
-                            confidence=ConfidenceFile(level, scale) if level else None)
-            if depth.is_file() else None))
+            depth=lidar_depth(depth if depth.is_file() else None, levels.get(image.stem), lens,
+                              high=scale)))
     return listed, len(by_time) - len(shown)
 
 

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.datasets.app_frames import (
-    MILLIMETRE,
     PICTURES,
     LeftOut,
     list_numbered,
     quoted,
     tracked_set,
 )
-from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.depth_file import lidar_depth
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 
@@ -51,10 +50,7 @@ def read_scanner_app(folder: Path) -> PosedSet:
             continue
         image = _list_frame(path, texts[number], left_out)
         if image is not None:
-            confidence = ConfidenceFile(levels[number]) if number in levels else None
-            depth = DepthFile(
-                depths[number], MILLIMETRE, image[0], confidence=confidence,
-                reliable=LIDAR_RANGE) if number in depths else None
+            depth = lidar_depth(depths.get(number), levels.get(number), image[0])
             listed.append(PosedImage(
                 path.name, path, image[0], image[1], depth=depth, time=image[2]))
     return tracked_set(

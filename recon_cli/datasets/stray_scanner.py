@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from recon_cli.capture.video import open_video, read_declared_length
 from recon_cli.datasets.app_frames import (
-    MILLIMETRE,
     Y_UP,
     LeftOut,
     fit_intrinsics,
@@ -29,7 +28,7 @@ from recon_cli.datasets.app_frames import (
     read_csv,
     tracked_set,
 )
-from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
+from recon_cli.datasets.depth_file import lidar_depth
 from recon_cli.datasets.phone_gravity import read_gravity
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
@@ -75,9 +74,7 @@ def read_stray(folder: Path) -> PosedSet:
         lens = left_out.lens(name, size, _intrinsics, row, inner)
         if lens is None:
             continue
-        confidence = ConfidenceFile(levels[number]) if number in levels else None
-        depth = DepthFile(depths[number], MILLIMETRE, lens, confidence=confidence,
-                          reliable=LIDAR_RANGE) if number in depths else None
+        depth = lidar_depth(depths.get(number), levels.get(number), lens)
         listed.append(PosedImage(
             f"{number:06d}.png", video, lens, viewmat, depth=depth, frame=number,
             time=_time(row)))

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
+from recon_cli.datasets.exported_files import read_cloud
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.posed import (
     PosedImage,
@@ -167,13 +168,13 @@ def read_transforms(path: Path) -> PosedSet:
         else:
             missing.append(name)
     posed = find_images("transforms", listed, path, missing=missing)
-    points, colors, point_notices = _read_points(path if path.is_file() else path / _FILE)
+    posed = _add_points(posed, path if path.is_file() else path / _FILE)
     notices += [*finder.notices(), *_describe_unread([frame for frame, _ in used], listed)]
     depth = any(image.depth is not None for image in posed.images)
     return replace(
         posed, metric=depth, metric_by_depth=depth,
-        splits=any(image.held_out for image in posed.images), points=points, colors=colors,
-        notices=(*notices, *posed.notices, *point_notices))
+        splits=any(image.held_out for image in posed.images),
+        notices=(*notices, *posed.notices))
 
 
 def list_cameras(path: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
@@ -369,25 +370,16 @@ def _unit(frame: _Frame) -> float:
     return _DEPTH_UNIT if unit is None else unit
 
 
-def _read_points(
-    file: Path,
-) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None, tuple[str, ...]]:
-    """Returns nerfstudio's sparse points and their colours, and notices."""
-    if not file.is_file():
-        return None, None, ()
-    name = read_json(file, hint=_HINT, finite=False).get("ply_file_path")
+def _add_points(posed: PosedSet, file: Path) -> PosedSet:
+    """Returns the set with nerfstudio's sparse points; a notice where they are missing."""
+    name = read_json(file, hint=_HINT, finite=False).get("ply_file_path") if is_file(file) else None
     if name is None:
-        return None, None, ()
+        return posed
     path = resolve_inside(file.parent, name, f"{file}, ply_file_path,")
     if not is_file(path):
-        return None, None, (f"its points {name} are missing",)
-    # Late, for it imports torch, which nothing else here needs.
-    from recon_cli.splats.ply import read_ply_points
-
-    points, colors = read_ply_points(path)
-    if colors is None:
-        return points, np.full(points.shape, 128, np.uint8), (f"its points {name} have no colours",)
-    return points, colors, ()
+        return replace(posed, notices=(*posed.notices, f"its points {name} are missing"))
+    points, colors = read_cloud(path)
+    return replace(posed, points=points, colors=colors)
 
 
 @dataclass(frozen=True)

@@ -155,8 +155,8 @@ def twice(folder, names, *, placed=True, labels=("left", "right")):
         image.unlink()
     head, _, rest = text_.partition("<chunk")
     chunk = "<chunk" + rest.partition("</document>")[0]
-    second = chunk if placed else re.sub(
-        r"<component .*?</component>", '<component id="0"/>', chunk)
+    bare = re.sub(r"<component .*?</component>", '<component id="0"/>', chunk)
+    second = chunk if placed else bare
     (folder / "c.xml").write_text(
         head + chunk.replace('label="a"', f'label="{labels[0]}"')
         + second.replace('label="a"', f'label="{labels[1]}"') + "</document>")
@@ -171,7 +171,7 @@ def test_equal_labels_of_two_chunks_are_told_apart_by_folders_of_their_names(tmp
 
 def test_equal_labels_that_nothing_tells_apart_are_left_out_and_said(tmp_path):
     twice(tmp_path, ("one", "two"))
-    with pytest.raises(InputError, match="label other cameras have"):
+    with pytest.raises(InputError, match="nothing tells apart"):
         read_posed(tmp_path)
 
 

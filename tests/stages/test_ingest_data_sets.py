@@ -1,9 +1,11 @@
 """ingest of data sets that come with poses."""
 
+import json
 import logging
 
 import numpy as np
 import pytest
+from app_shots import GL, jpeg, shots
 from ingest_media import blocks, listed, take, walk, write_video
 from PIL import Image
 from posed_sets import (
@@ -13,8 +15,10 @@ from posed_sets import (
     make_replica,
     make_scannet,
     make_transforms,
+    plane_depth,
     pose,
     transforms,
+    write_depth,
     write_image,
 )
 
@@ -204,3 +208,60 @@ def test_depth_of_an_unknown_unit_is_not_read_and_said_so(tmp_path, notices):
         frame["depth_path"] = "images/0.depth.png"
     take(make_transforms(tmp_path / "set", value), tmp_path / "out")
     assert any("depth of 4 frames is not read: its unit" in notice for notice in notices())
+
+
+def room_with_depth(folder, room, unit, suffix=".npy"):
+    """Writes a transforms.json of a room in metres, whose depth has values of `unit` metres."""
+    taken = shots(room, count=12, step=5, factor=4)
+    frames = []
+    for shot in taken:
+        jpeg(folder / "images" / f"{shot.number:02d}.jpg", shot.rgb)
+        depth = folder / "depth" / f"{shot.number:02d}{suffix}"
+        depth.parent.mkdir(exist_ok=True)
+        if suffix == ".npy":
+            np.save(depth, (shot.depth / unit).astype(np.float32))
+        else:
+            Image.fromarray(np.rint(shot.depth / unit).astype(np.uint16)).save(depth)
+        fx, fy, cx, cy = shot.inner
+        frames.append({
+            "file_path": f"images/{shot.number:02d}.jpg", "depth_file_path": f"depth/{depth.name}",
+            "transform_matrix": (shot.c2w @ GL).tolist(), "w": shot.size[0], "h": shot.size[1],
+            "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
+    return folder
+
+
+@pytest.mark.parametrize(("unit", "suffix"), [
+    (1e-3, ".png"), (1.0, ".npy"), (1 / 4000, ".png"), (1 / 5000, ".png")])
+def test_depth_in_another_unit_gives_points_where_the_room_is(
+    tmp_path, shared_data, notices, unit, suffix
+):
+    folder = room_with_depth(tmp_path / "set", shared_data / "rooms" / "office", unit, suffix)
+    assert take(folder, tmp_path / "out").metric
+    low, high = np.quantile(known(tmp_path / "out").points, (0.02, 0.98), axis=0)
+    assert (low > -0.3).all()
+    assert (high < (5.2, 4.5, 2.9)).all()  # the room is 4.9 x 4.2 x 2.6 m
+    assert (high - low).max() > 3
+    assert any("The depth fits the poses in" in text for text in notices()) == (unit != 1e-3)
+
+
+def test_depth_that_fits_in_no_unit_gives_neither_points_nor_metres(
+    tmp_path, shared_data, notices
+):
+    folder = room_with_depth(tmp_path / "set", shared_data / "rooms" / "office", 0.0254)
+    summary = take(folder, tmp_path / "out")
+    assert not summary.metric
+    assert summary.points is None
+    assert any("The depth is not used" in text and "25 times" in text for text in notices())
+
+
+def test_depth_that_nothing_shows_leaves_the_unit_open(tmp_path, notices):
+    value = transforms(frames=4)
+    for number, frame in enumerate(value["frames"]):
+        frame["depth_file_path"] = f"depth/{number}.png"
+        write_depth(tmp_path / "set" / "depth" / f"{number}.png", plane_depth(pose(0)), 1000)
+        frame["transform_matrix"] = value["frames"][0]["transform_matrix"]
+    summary = take(make_transforms(tmp_path / "set", value), tmp_path / "out")
+    assert not summary.metric
+    assert summary.points > 100
+    assert any("Nothing shows whether the depth fits" in text for text in notices())
