@@ -312,7 +312,7 @@ def disk_errors(root: Path, doing: str) -> Iterator[None]:
     except Exception as error:
         explained = _explain(error, root, doing) if before in (None, _identity(root)) else (
             WorkspaceError(
-                f"The workspace {root} was renamed or deleted while {doing}.",
+                f"{root} was renamed or deleted while {doing}.",
                 hint="Run the same command with -w and its new place; it continues there."))
         if explained is None:
             raise
@@ -348,8 +348,17 @@ def _is_in_use(leftover: Path) -> bool:
 
 
 def _has_manifest(folder: Path) -> bool:
-    """Returns whether a folder has a manifest, be it a link that leads nowhere."""
-    return os.path.lexists(folder / manifest.NAME)
+    """Returns whether a folder has a manifest, be it a link that leads nowhere.
+
+    PermissionError where that cannot be known: a result is not missing for that.
+    """
+    try:
+        os.lstat(folder / manifest.NAME)
+    except PermissionError:
+        raise
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _complete(folder: Path) -> bool:

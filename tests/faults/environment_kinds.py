@@ -35,6 +35,8 @@ from lab import FULL, SETTINGS, STAGES
 from moments import Moments
 from structure_kinds import resign
 
+from recon_cli.kernels.kernel import CODE, cache_folder
+
 _READ = ("render", "eval", "export", "report", "status")  # what a scene of any version allows
 _MB = 1 << 20
 _SCENE = Path("train") / "splats.ply"
@@ -188,7 +190,7 @@ def _obey_permissions() -> None:
 def permissions(case: Case) -> Verdict:
     """A workspace, or a part of it, that may be read alone or not at all."""
     workspace = case.workspace()
-    part = str(case.pick((".", ".", *STAGES, "recon.toml", "report.html")))
+    part = str(case.pick((".", ".", *STAGES, "recon.toml", "train/splats.ply")))
     mode = case.rng.choice((0o555, 0o555, 0o444, 0o000))
     verb = str(case.rng.choice(tuple(FULL)))
     path, before = workspace / part, snapshot(workspace)
@@ -269,8 +271,10 @@ def renamed(case: Case) -> Verdict:
 
 def kernel_cache(case: Case) -> Verdict:
     """A damaged file among the compiled kernels: compiled again with a notice."""
-    cache = Path(shutil.copytree(os.environ["RECON_CACHE_DIR"], case.folder / "cache"))
-    names = sorted(cache.rglob("*.nbc"), key=lambda path: path.stat().st_mtime)[-13:]
+    own, cache = cache_folder(), case.folder / "cache"
+    assert own is not None
+    copied = Path(shutil.copytree(own, cache / "kernels" / own.name))
+    names = sorted(copied.rglob(f"*{CODE}"))
     damage = str(case.pick(("flip", "flip", "cut", "empty", "grow", "text", "other", "delete")))
     path = case.rng.choice(names)
     DAMAGES[damage](path, case.rng, case.folder / "spare")

@@ -187,6 +187,24 @@ def test_the_hint_of_a_damaged_manifest_names_the_scene_beside_it(workspace: Wor
     assert 0 <= hint.index(str(workspace.folder("train") / "splats.ply")) < hint.index("clean")
 
 
+def test_a_result_that_may_not_be_looked_at_is_not_missing(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with workspace.writing("train"):
+        finish(workspace, "one")
+    real = os.lstat
+
+    def deny(path: str | Path) -> os.stat_result:
+        if Path(path).parent == workspace.folder("train"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr(os, "lstat", deny)
+    with pytest.raises(WorkspaceError, match="Permission denied"), disk_errors(
+            workspace.root, "reading"):
+        workspace.manifest("train")
+
+
 def test_a_crash_at_any_rename_leaves_the_old_or_the_new_result_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
