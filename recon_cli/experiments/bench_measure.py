@@ -221,12 +221,6 @@ class _Measurement:
         _render_and_back(build_scene(QUICK, self._scene.sh_degree, device), renderer)
         return instruments.measure_memory(partial(_render_and_back, self._scene, renderer), device)
 
-    def _time(self, work: Callable[[], object]) -> Mapping[str, float]:
-        watch = Stopwatch(self._plan.device)
-        work()
-        watch.mark("whole")
-        return watch.ms
-
     def _time_backend(self, backend: str, threads: int) -> Work:
         """Returns a function that times both passes and a step."""
         step = training_step(self._scene, backend)

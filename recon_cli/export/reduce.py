@@ -63,7 +63,7 @@ def reduce_scene(
         return after
 
     def bound() -> Splats:
-        bounded = source.bound(splats) if source.has_views else splats
+        bounded = source.bound(splats)
         return splats if bounded is splats else step("backdrop", bounded)
 
     if config.drop_floaters:

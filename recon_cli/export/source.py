@@ -136,7 +136,11 @@ class ExportSource:
         return self._inputs.folders["ingest"]
 
     def bound(self, splats: Splats) -> Splats:
-        """Returns a scene of the files that reaches little farther than its room."""
+        """Returns a scene of the files that reaches little farther than the room that views show.
+        """
+        record = ImportRecord.read(self._inputs.folders["train"])
+        if not self.has_views or (record and record.doubt):  # its room is not known
+            return splats
         cameras = np.stack([camera.center for _, camera in self.place(self.scene.train)])
         views = [fit_camera(self._similarity.camera(view.camera), SIZE)
                  for view in evenly_spread(self.scene.train, VIEWS)]

@@ -22,6 +22,7 @@ from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.splats.registry import FORMATS
 from recon_cli.stages import export
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
+from recon_cli.workspace.records import ImportRecord
 
 
 @pytest.fixture
@@ -92,6 +93,10 @@ def test_files_are_bounded_but_the_page_and_what_is_kept(inputs, whole, tmp_path
     assert torch.equal(read_ply(tmp_path / "kept" / "splats.ply").means, far.means)
     assert kept.gaussians == len(far.with_sphere())
     assert kept.changes is None
+    ImportRecord("a.ply", "ply", "", len(far), 3, True, True, doubt="it may not fit").write(folder)
+    (tmp_path / "doubted").mkdir()
+    exported(inputs, tmp_path / "doubted")  # its room is not known
+    assert torch.equal(read_ply(tmp_path / "doubted" / "splats.ply").means, far.means)
 
 
 def test_the_old_spelling_of_the_backdrop_works_or_says_what_to_write(tmp_path, capsys):

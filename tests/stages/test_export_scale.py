@@ -11,6 +11,7 @@ from scenes import random_splats
 from tiny_scene import make_inputs
 
 from recon_cli.config.export import ExportConfig
+from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.export.coordinate_frame import choose_frame, find_room_frame
@@ -21,6 +22,7 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.align_world import world_transform
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export
+from recon_cli.train.train_data import write_config
 
 
 @pytest.fixture
@@ -29,6 +31,7 @@ def inputs(tmp_path):
     given = make_inputs(tmp_path)
     (tmp_path / "train").mkdir()
     write_ply(tmp_path / "train" / "splats.ply", random_splats(30, dtype=torch.float32))
+    write_config(tmp_path / "train", RunConfig())
     (tmp_path / "out").mkdir()
     return StageInputs({**given.folders, "train": tmp_path / "train"})
 

@@ -28,7 +28,7 @@ from recon_cli.render.numba.view_pass import (
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
-KERNELS = 13  # that threads share; the progress counts these
+KERNELS = 12  # that threads share; the progress counts these
 _SCIPY = "scipy.linalg"
 _WAIT_SECONDS = 0.25  # between looks at how far another process is
 _READY = "ready"  # file in the cache folder once every kernel is there
