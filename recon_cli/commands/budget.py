@@ -78,10 +78,10 @@ def run_within(
             most = _most_frames(inputs, left(), threads, slowness)
         budget = Budget(
             minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), max_frames=most)
-        write_json(workspace.root / FILE, budget.to_json())
     frames: Settings = ({} if budget.max_frames is None
                         else {"ingest": {"max_frames": budget.max_frames}})
     stages("ingest", frames=frames)
+    write_json(workspace.root / FILE, budget.to_json())  # now that there is a folder
     call.deadline = Deadline(_SFM * left(), clock)
     _report_frames(workspace, budget, call.deadline.seconds, threads, slowness)
     stages("denoise", "sfm", frames=frames)
