@@ -33,7 +33,7 @@ _SFM = 0.4  # of the time that is left after ingest beside scores, at most
 _PRUNE = 0.45  # of the seconds of training, set aside
 _LATE = 1.15  # of the minutes, from which the user is told
 _SCORES = 20.0  # seconds of evaluate, export and report, on the machine of sfm.time_estimate
-_LEAST_TRAINING = 12.0  # seconds, likewise
+_LEAST_TRAINING, _LEAST_PRUNING = 12.0, 12.0  # seconds, likewise; the demo is pruned in 13
 
 logger = logging.getLogger("recon")
 
@@ -78,27 +78,28 @@ def run_within(
             most = _most_frames(inputs, left(), threads, slowness)
         budget = Budget(
             minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), max_frames=most)
-        write_json(workspace.root / FILE, budget.to_json())
     frames: Settings = ({} if budget.max_frames is None
                         else {"ingest": {"max_frames": budget.max_frames}})
     stages("ingest", frames=frames)
+    write_json(workspace.root / FILE, budget.to_json())  # now that there is a folder
     call.deadline = Deadline(_SFM * left(), clock)
     _report_frames(workspace, budget, call.deadline.seconds, threads, slowness)
     stages("denoise", "sfm", frames=frames)
     if budget.train_minutes is None:
-        seconds = left() / (1 + _PRUNE) if with_prune else left()
-        seconds = max(seconds, _LEAST_TRAINING * slowness)
-        budget = dataclasses.replace(budget, train_minutes=round(seconds / 60, 2))
+        pruning = left() * _PRUNE / (1 + _PRUNE)
+        prune = with_prune and pruning >= _LEAST_PRUNING * slowness
+        seconds = max(left() - pruning * prune, _LEAST_TRAINING * slowness)
+        budget = dataclasses.replace(
+            budget, train_minutes=round(seconds / 60, 2), prune=None if prune else False)
         write_json(workspace.root / FILE, budget.to_json())
     training: Settings = {"train": {"minutes": budget.train_minutes}}
     stages("train", frames=frames, training=training)
     if budget.prune is None:
-        budget = dataclasses.replace(
-            budget, prune=with_prune and left() > _pruning_seconds(workspace))
+        budget = dataclasses.replace(budget, prune=left() > _pruning_seconds(workspace))
         write_json(workspace.root / FILE, budget.to_json())
-        if with_prune and not budget.prune:
-            logger.warning("there is no time to prune in %g minutes: the scene keeps all its "
-                           "Gaussians; `recon prune` removes some", minutes)
+    if with_prune and not budget.prune:
+        logger.warning("there is no time to prune in %g minutes: the scene keeps all its "
+                       "Gaussians; `recon prune` removes some", minutes)
     stages(*["prune"] * bool(budget.prune), "evaluate", "export", frames=frames, training=training)
     if deadline.spent > _LATE * deadline.seconds:
         logger.warning("the run took %.1f minutes, more than the %g of --minutes",

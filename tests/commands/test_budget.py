@@ -63,10 +63,11 @@ def test_the_parts_of_a_run_add_up_to_its_minutes(tmp_path, monkeypatch, minutes
     clock = FakeRun(monkeypatch, {**USUAL, "sfm": 20.0 * minutes})
     chosen = run(tmp_path, clock, minutes)
     assert 0.85 <= clock.now / (60 * minutes) <= 1.15
-    assert chosen["prune"] is True
+    assert chosen["prune"] is (minutes > 2)
     assert chosen["max_frames"] == 60
     assert clock.ran.count("ingest") == 1
-    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    given_up = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert len(given_up) == (not chosen["prune"])
 
 
 def test_cameras_get_a_share_of_what_ingest_left(tmp_path, monkeypatch):
@@ -82,6 +83,15 @@ def test_pruning_that_has_no_time_is_left_out_and_said(tmp_path, monkeypatch, ca
     assert run(tmp_path, clock, 2.0)["prune"] is False
     assert "prune" not in clock.ran
     assert "no time to prune" in caplog.text
+
+
+def test_training_gets_the_time_of_a_pruning_that_would_be_too_short(tmp_path, monkeypatch):
+    clock = FakeRun(monkeypatch, {**USUAL, "sfm": 50.0})
+    chosen = run(tmp_path, clock, 2.0)
+    assert chosen["prune"] is False
+    assert 60 * chosen["train_minutes"] == pytest.approx(
+        120 - 8 - 3 - 50 - budget._SCORES * SLOWNESS, abs=0.5)
+    assert 0.85 <= clock.now / 120 <= 1.15
 
 
 def test_a_run_that_goes_on_keeps_what_was_chosen(tmp_path, monkeypatch):

@@ -65,7 +65,7 @@ def test_the_numbers_of_a_plan_repeat_the_run_to_the_byte(inputs, done, tmp_path
     first, summary = done
     again = replace(
         OPEN, minutes=None, iterations=summary.planned_iterations,
-        max_gaussians=summary.max_gaussians, max_size=summary.max_size)
+        max_gaussians=summary.max_gaussians, max_size=summary.max_size, **summary.parts)
     run(again, inputs, tmp_path / "again")
     assert same_bytes(first, tmp_path / "again")
 
@@ -83,7 +83,7 @@ def test_an_interrupted_run_goes_on_by_its_recorded_plan(inputs, tmp_path, monke
     assert (out / "plan.json").read_bytes() == recorded
     whole = replace(
         OPEN, minutes=None, iterations=summary.planned_iterations,
-        max_gaussians=summary.max_gaussians, max_size=summary.max_size)
+        max_gaussians=summary.max_gaussians, max_size=summary.max_size, **summary.parts)
     run(whole, inputs, tmp_path / "whole")
     assert same_bytes(out, tmp_path / "whole")
 
@@ -111,7 +111,7 @@ def test_images_in_a_file_change_no_byte(inputs, done, tmp_path, monkeypatch):
     monkeypatch.setattr(train_data, "image_file", opening)
     again = replace(
         OPEN, minutes=None, iterations=summary.planned_iterations,
-        max_gaussians=summary.max_gaussians, max_size=summary.max_size)
+        max_gaussians=summary.max_gaussians, max_size=summary.max_size, **summary.parts)
     run(again, inputs, tmp_path / "again", replace(CONTEXT, scratch=tmp_path / "scratch"))
     assert opened
     assert same_bytes(first, tmp_path / "again")

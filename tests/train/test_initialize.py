@@ -62,7 +62,7 @@ def test_surfaces_by_stereo_begin_with_gaussians_where_sparse_points_leave_room(
         stereo, cap, more):
     surfaces = SurfacePoints(GRID[:3] + 20.0, np.full((3, 3), 200, np.uint8))
     task = tiny_task(replace(CONFIG, stereo=stereo, max_gaussians=cap))
-    task = replace(task, stereo=SimpleNamespace(found=surfaces))
+    task = replace(task, stereo=SimpleNamespace(search=lambda _: surfaces))
     splats = first_state(task, GRID, GREY, most=100).splats
     assert len(splats) == 27 + more
     added = splats.means.detach().numpy()[27:]
