@@ -169,15 +169,16 @@ def test_raw_photos_are_developed_alike_and_the_gains_are_recorded(tmp_path):
 
 def test_colours_and_lenses_that_are_corrected_are_told(tmp_path, notices):
     folder = write_raw(tmp_path / "room", [0, 0, 0])
-    for path in folder.iterdir():
-        shaded = gain_map(np.full((2, 2, 1), 1.75), size=(96, 128))
-        write_shot(path, linear(blocks(96, 128)) * 0.3, Shot(more={BEFORE: opcodes(shaded)}))
+    shaded = opcodes(gain_map(np.full((2, 2, 1), 1.75), size=(96, 128)))
+    for seed, path in enumerate(sorted(folder.iterdir())):
+        write_shot(path, linear(blocks(96, 128, seed=seed)) * 0.3, Shot(more={BEFORE: shaded}))
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA001] = 2
     Image.fromarray(blocks(96, 128, seed=7)).save(folder / "a.jpg", exif=exif)
     take(folder, tmp_path / "out")
     told = "\n".join(notices())
-    assert_facts(told, "1 photo", "Adobe RGB", "3 RAW photos", "1.75")
+    assert_facts(told, "1 photo", "Adobe RGB")
+    assert_facts(told, "3 RAW photos", "1.75")
 
 
 def test_a_plan_that_is_there_is_kept_and_gives_the_same_frames(tmp_path, monkeypatch):
