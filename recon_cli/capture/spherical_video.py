@@ -45,11 +45,11 @@ def refuse_unusable(path: Path, camera: str) -> None:
         raise _unstitched(path, stitcher, len(sizes))
     if camera == "perspective":
         return
-    shown = [picture.rgb() for picture in video.sample_frames(path, _LOOKED_AT)
+    pictures = [picture.rgb() for picture in video.sample_frames(path, _LOOKED_AT)
              if picture.tags.packing is None]
-    if has_two_circles(shown):
+    if has_two_circles(pictures):
         raise _unstitched(path, None, 1)
-    packing = find_two_views(shown)
+    packing = find_two_views(pictures)
     if packing is not None:
         crop = "iw/2:ih:0:0" if packing is Packing.SIDE_BY_SIDE else "iw:ih/2:0:0"
         raise InputError(
