@@ -150,7 +150,8 @@ def read_tags(stream: VideoStream, frame: av.VideoFrame) -> Tags:
         aspect *= _unsqueeze(frame.width * aspect / frame.height, packing)
     return Tags(
         aspect, TRANSFERS.get(int(context.color_trc)), int(context.color_primaries),
-        nearest_orientation(*_display_matrix(frame)), packing, int(context.color_trc), right_first)
+        nearest_orientation(*_display_matrix(frame)), packing=packing, right_first=right_first,
+        transfer_code=int(context.color_trc))
 
 
 def read_side_data(frame: av.VideoFrame, kind: str) -> bytes | None:

@@ -73,7 +73,8 @@ def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) 
     for notice in scan.notices:
         ctx.notice(notice)
     _report_lost(path, scan, ctx)
-    if not is_spherical(path, scan.width, scan.height, len(scan.intact), config.camera):
+    if not is_spherical(
+            path, scan.width, scan.height, len(scan.intact), config.camera, size=scan.size):
         return judge(config, path, scan, ctx)
     ctx.notice(f"{path.name} is used as a 360-degree video (equirectangular); --camera perspective "
                "uses it as an ordinary one.")

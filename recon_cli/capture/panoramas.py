@@ -69,21 +69,21 @@ def _drop_double(folder: str, photos: Sequence[Photo]) -> tuple[list[Photo], lis
             "Export them as 360-degree (equirectangular) pictures with the app of the camera."),
         "3D pictures with the views of both eyes side by side": (
             _find_double(photos, lambda shape: shape > 2 * (1 + _ASPECT),
-                         lambda shown: find_two_views(shown) is Packing.SIDE_BY_SIDE),
+                         lambda pictures: find_two_views(pictures) is Packing.SIDE_BY_SIDE),
             "Cut one view out, for example with mkdir left && magick mogrify -path left -crop "
             "50%x100%+0+0 +repage *.jpg")}
-    left, notices = list(photos), []
-    for kind, (found, advice) in doubled.items():
-        left = [photo for photo in left if photo not in found]
-        if found and len(left) < MIN_FRAMES:
+    singles, notices = list(photos), []
+    for kind, (doubles, advice) in doubled.items():
+        singles = [photo for photo in singles if photo not in doubles]
+        if doubles and len(singles) < MIN_FRAMES:
             raise InputError(
-                f"{len(found)} of the {len(photos)} pictures in {folder} are {kind}, such as "
-                f"{found[0].name}.",
+                f"{len(doubles)} of the {len(photos)} pictures in {folder} are {kind}, such as "
+                f"{doubles[0].name}.",
                 hint=f"{advice} --camera perspective uses them as ordinary photos.")
-        if found:
-            names = list_names([photo.name for photo in found], _NAMED)
-            notices.append(f"{len(found)} {kind} are left out: {names}. {advice}")
-    return left, notices
+        if doubles:
+            names = list_names([photo.name for photo in doubles], _NAMED)
+            notices.append(f"{len(doubles)} {kind} are left out: {names}. {advice}")
+    return singles, notices
 
 
 def _find_double(

@@ -45,11 +45,11 @@ def refuse_unusable(path: Path, camera: str) -> None:
         raise _unstitched(path, stitcher, len(sizes))
     if camera == "perspective":
         return
-    shown = [picture.rgb() for picture in video.sample_frames(path, _LOOKED_AT)
+    pictures = [picture.rgb() for picture in video.sample_frames(path, _LOOKED_AT)
              if picture.tags.packing is None]
-    if has_two_circles(shown):
+    if has_two_circles(pictures):
         raise _unstitched(path, None, 1)
-    packing = find_two_views(shown)
+    packing = find_two_views(pictures)
     if packing is not None:
         crop = "iw/2:ih:0:0" if packing is Packing.SIDE_BY_SIDE else "iw:ih/2:0:0"
         raise InputError(
@@ -67,10 +67,14 @@ def _unstitched(path: Path, stitcher: str | None, tracks: int) -> InputError:
         f"{'' if stitcher else ' of the camera'}, with stabilisation on, and give that.")
 
 
-def is_spherical(path: Path, width: int, height: int, frames: int, camera: str) -> bool:
+def is_spherical(
+    path: Path, width: int, height: int, frames: int, camera: str, *,
+    size: tuple[int, int] | None = None,
+) -> bool:
     """Returns whether a video is a stitched 360-degree one; `camera` is that of IngestConfig.
 
-    `width`, `height` and `frames` are those of the scan. InputError for one in another projection.
+    `width`, `height`, `frames` and `size` are those of the scan. InputError for one in another
+    projection.
     """
     if camera == "perspective":
         return False
@@ -89,7 +93,8 @@ def is_spherical(path: Path, width: int, height: int, frames: int, camera: str) 
     if width != 2 * height:
         return False
     chosen = {index for index in range(0, _LOOKED_AT * _EVERY, _EVERY) if index < frames}
-    around = [wraps_around(rgb) for _, rgb in video.frames_at(path, chosen, threads=1)]
+    around = [wraps_around(rgb) for _, rgb in video.frames_at(
+        path, chosen, threads=1, size=size)]
     return sum(around) >= min(_LEAST, len(around))
 
 

@@ -50,14 +50,14 @@ def find_two_views(pictures: Sequence[NDArray[np.uint8]]) -> Packing | None:
     Of pictures with too little to match nothing is known; None where that are all.
     """
     for packing, axis in ((Packing.SIDE_BY_SIDE, 1), (Packing.TOP_AND_BOTTOM, 0)):
-        shown = False
+        has_evidence = False
         for picture in pictures:
             answer = _shows_twice(_reduce(picture), axis)
             if answer is False:
                 break
-            shown = shown or answer is True
+            has_evidence = has_evidence or answer is True
         else:
-            if shown:
+            if has_evidence:
                 return packing
     return None
 
