@@ -44,13 +44,8 @@ IMPORT = {
 
 @pytest.mark.parametrize(("stage", "summary", "facts"), [
     ("ingest", INGEST, ("75 of 1,200 frames", "video", "600x340", "10 held out", "6 too blurred")),
-<<<<<<< HEAD
     ("denoise", {"mode": "auto", "frames": 12, "denoised": 3, "median_sigma_255": 0.3263}, (
         "noise 0.3 of 255", "3 of 12 frames filtered")),
-=======
-    ("denoise", {"mode": "auto", "frames": 12, "denoised": 3, "median_sigma_255": 0.3263},
-     ("noise 0.3 of 255", "3 of 12 frames filtered")),
->>>>>>> video
     ("sfm", SFM, ("70 of 75 frames placed", "the model is trusted")),
     ("sfm", SFM | {"verdict": {"trusted": False}, "left_out": ["a.png"]},
      ("NOT trusted", "1 left out")),
