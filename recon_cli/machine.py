@@ -121,12 +121,10 @@ def free_memory_bytes() -> int:
 
 def _address_limit_bytes() -> int | None:
     """Returns how much memory this process may map (`ulimit -v`); None without a limit."""
-    if sys.platform == "win32":
+    if not hasattr(psutil, "RLIMIT_AS"):  # other systems than Linux have or obey none
         return None
-    import resource
-
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return None if limit == resource.RLIM_INFINITY else limit
+    limit = psutil.Process().rlimit(psutil.RLIMIT_AS)[0]
+    return None if limit == psutil.RLIM_INFINITY else limit
 
 
 def refuse_low_limit() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
@@ -114,9 +114,14 @@ def build_report(job: Job, folder: Path) -> bytes:
             damaged = f"The scores are not shown: {error.message}"
     values = _template_values(job, stages, metrics, damaged, folder)
     rename = name_photos(stages["ingest"].folder)
-    environment = _environment().overlay(
-        finalize=lambda value: rename(value) if (
-            type(value) is str and not value.startswith("data:")) else value)
+    rename_marked = name_photos(stages["ingest"].folder, shown=lambda name: str(escape(name)))
+
+    def name_in(value: Any) -> Any:
+        if isinstance(value, Markup):  # a drawing with titles
+            return Markup(rename_marked(value))
+        return rename(value) if isinstance(value, str) and value[:5] != "data:" else value
+
+    environment = _environment().overlay(finalize=name_in)
 
     def render(gallery: Gallery) -> bytes:
         data = [_script_data(view, rename(view.name)) for view in gallery.views]

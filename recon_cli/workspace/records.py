@@ -110,14 +110,15 @@ def list_photos(frames: Sequence[Frame]) -> dict[str, str]:
             if frame.time_seconds is None and shared[frame.source] == 1}
 
 
-def name_photos(ingest: Path) -> Callable[[str], str]:
+def name_photos(ingest: Path, *, shown: Callable[[str], str] = str) -> Callable[[str], str]:
     """Returns a function that calls photos in a text by their own names; `ingest` is the folder.
 
-    Apply it once, and last: a photo may be called as the frame of another one is. Without a list
-    of frames the text stays.
+    `shown` returns a name as the text needs it, such as escaped. Apply the function once, and last:
+    a photo may be called as the frame of another one is. Without a list of frames the text stays.
     """
     try:
-        photos = list_photos(read_frame_list(ingest).frames)
+        photos = {name: shown(photo) for name, photo in list_photos(
+            read_frame_list(ingest).frames).items()}
     except FormatError:
         return str
     return lambda text: _FRAME_NAME.sub(lambda found: photos.get(found[0], found[0]), text)

@@ -69,6 +69,20 @@ def test_run_does_everything_and_ends_with_its_results(capsys: Said) -> None:
     assert fake_stages.ran == NAMES
 
 
+def test_eval_prints_its_table_and_what_the_scores_mean_only_where_asked(capsys: Said) -> None:
+    assert main(["run", "room.mp4", "--no-prune"]) == 0
+    capsys.readouterr()
+    assert main(["eval"]) == 0
+    assert capsys.readouterr().out.endswith("the table of evaluate\n\n")
+    assert main(["eval", "--explain"]) == 0
+    before, table, explained = capsys.readouterr().out.partition("the table of evaluate\n\n")
+    assert table
+    assert {"PSNR", "8-bit", "SSIM", "SSIM 0-pad", "LPIPS", "masks"} <= {
+        line.partition(":")[0] for line in explained.splitlines()}
+    assert "PSNR:" not in before
+    assert main(["eval", "--explain", "--form", "csv"]) == 2
+
+
 def test_run_can_leave_pruning_out() -> None:
     assert main(["run", "room.mp4", "--no-prune"]) == 0
     assert fake_stages.ran == [name for name in NAMES if name != "prune"]

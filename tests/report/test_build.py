@@ -329,3 +329,17 @@ def test_the_whole_file_stays_within_its_bounds(workspace, monkeypatch):
     assert len(page.encode()) <= limit
     assert "Pictures are scaled down for this page" in page
     assert "evaluate scored 400x300" in page
+
+
+def test_the_page_calls_photos_by_their_own_names_escaped(workspace):
+    def name(frames):
+        for index, frame in enumerate(frames["frames"]):
+            frame.update(time_seconds=None, source=f"<b>&{index}.jpg")
+
+    change(workspace / "ingest" / "frames.json", name)
+    page = page_of(workspace)
+    names = [frame["name"] for frame in json.loads(
+        (workspace / "ingest" / "frames.json").read_text())["frames"]]
+    assert not [one for one in names if one in page]
+    assert "&lt;b&gt;&amp;" in page
+    assert "<b>&" not in page
