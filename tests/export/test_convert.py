@@ -97,7 +97,7 @@ def test_scale_and_up_turn_the_whole_scene(tmp_path: Path) -> None:
         read_ply(tmp_path / "b.ply").means, 3 * torch.stack([x, z, -y], dim=1), atol=1e-5)
     run(tmp_path / "a.ply", tmp_path / "c.ply")
     assert load_splats(tmp_path / "c.ply").up == "z"
-    assert load_splats(tmp_path / "b.ply").up is None
+    assert load_splats(tmp_path / "b.ply").up == "y"
     run(tmp_path / "a.ply", tmp_path / "d.spz", up="-y", max_loss=9.0)
     assert load_splats(tmp_path / "d.spz").up == "-y"
 
