@@ -155,7 +155,7 @@ def environment(case: Case) -> Verdict:
     words = (*FULL[verb], "-w", str(workspace))
     case.tell(f"{' '.join(words)} with: {name}")
     before = snapshot(workspace)
-    done = (case.finish(case.start_process(*words, flags=("-O",))) if name == "-O"
+    done = (case.finish(case.start_process(*words, flags=("-O",)), 4 * LIMIT) if name == "-O"
             else case.run(*words, prepare=kinds[name]))
     if lost := lost_files(before, workspace, spares(verb, words)):
         return wrong(Outcome.LOST, done, f"changed: {lost[:5]}")
