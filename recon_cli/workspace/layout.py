@@ -332,7 +332,7 @@ def _explain(error: Exception, root: Path, doing: str) -> ReconError | None:
     if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and (
             error.filename is None or Path(os.fsdecode(error.filename)).is_relative_to(root)):
         return WorkspaceError(
-            f"The workspace is not writable while {doing}: {error}.",
+            f"The workspace is not readable or not writable while {doing}: {error}.",
             hint=f"Check the permissions of {root}, or give another workspace with -w.")
     return disk.explain(error, root, doing)
 

@@ -31,7 +31,7 @@ from judge import (
     spares,
     wrong,
 )
-from lab import FULL, SETTINGS, STAGES
+from lab import FULL, LIMIT, SETTINGS, STAGES
 from moments import Moments
 from structure_kinds import resign
 
@@ -155,7 +155,7 @@ def environment(case: Case) -> Verdict:
     words = (*FULL[verb], "-w", str(workspace))
     case.tell(f"{' '.join(words)} with: {name}")
     before = snapshot(workspace)
-    done = (case.finish(case.start_process(*words, flags=("-O",))) if name == "-O"
+    done = (case.finish(case.start_process(*words, flags=("-O",)), 4 * LIMIT) if name == "-O"
             else case.run(*words, prepare=kinds[name]))
     if lost := lost_files(before, workspace, spares(verb, words)):
         return wrong(Outcome.LOST, done, f"changed: {lost[:5]}")
@@ -281,7 +281,8 @@ def kernel_cache(case: Case) -> Verdict:
     workspace = case.workspace(without=("render",))
     case.tell(f"{damage} of {path.name}, then render")
     done = case.finish(case.start_process(
-        *FULL["render"], "-w", str(workspace), environment={"RECON_CACHE_DIR": str(cache)}))
+        *FULL["render"], "-w", str(workspace), environment={"RECON_CACHE_DIR": str(cache)}),
+        4 * LIMIT)  # it starts anew, and may compile every kernel
     if done.code:
         return case.judge_error(done, workspace)
     wrongs = differing(case.lab, workspace, ["render"])
@@ -301,8 +302,8 @@ def bad_batch(case: Case) -> Verdict:
             bad, case.rng, case.folder / "spare")
         inputs.insert(case.rng.randrange(len(inputs) + 1), bad)
     (case.folder / "my.toml").write_text(SETTINGS)
-    done = case.run("batch", *map(str, inputs), "--out", str(out), "--config",
-                    str(case.folder / "my.toml"))
+    done = case.finish(case.start("batch", *map(str, inputs), "--out", str(out), "--config",
+                                  str(case.folder / "my.toml")), 4 * LIMIT)
     if bad_end := broken(done):
         return bad_end
     try:
