@@ -162,7 +162,7 @@ def test_the_picture_is_drawn(tmp_path: Path) -> None:
     records = tuple(Record((point(0, 10), point(1, 20 + seed)), "") for seed in range(2))
     recipes = tuple(Variant(name, name) for name in ("one", "two"))
     scene = SceneRuns(3, 64, 48, {module.ALL: dict.fromkeys(("one", "two"), records)})
-    host = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
+    host = Host("A CPU", 2, 2, 16, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
     result = CurvesResult(host, 2, BASE, (), recipes, {"a": scene, "b": scene})
     module.draw(result, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 5000
