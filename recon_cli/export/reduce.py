@@ -124,7 +124,8 @@ def measure_change(
         gaussians_before=len(before.with_sphere()),
         degree=after.sh_degree, degree_before=before.sh_degree,
         psnr_change_db=round(psnr_db(after) - psnr_db(before), 4))
-    text = f"{option}: {change.gaussians:,} of {change.gaussians_before:,} Gaussians"
+    word = "of" if change.gaussians <= change.gaussians_before else "for"  # a finer backdrop
+    text = f"{option}: {change.gaussians:,} {word} {change.gaussians_before:,} Gaussians"
     if change.degree != change.degree_before:
         text += f", degree {change.degree_before} -> {change.degree}"
     logger.info("%s, %+.2f dB", text, change.psnr_change_db)

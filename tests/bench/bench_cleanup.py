@@ -99,8 +99,8 @@ def print_bounds(workspaces: tuple[Path, ...], ctx: StageContext) -> None:
         for name, make in (
                 ("keep", lambda scene=splats: scene.with_sphere()),
                 *((f"{most:g} rooms", partial(
-                    bounds.bound_scene, splats, room, cameras, ctx, most=most))
-                  for most in (30.0, 10.0, bounds.MOST_SPHERES)),
+                    bounds.bound_scene, splats, room, cameras, ctx, spheres=(most,)))
+                  for most in bounds.SPHERES),
                 ("drop", partial(replace, splats, backdrop=None))):
             begin = time.perf_counter()
             bounded = make()

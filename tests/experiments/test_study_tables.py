@@ -22,7 +22,7 @@ from recon_cli.experiments.study import (
 
 pytestmark = pytest.mark.floors
 
-HOST = Host("A CPU", 2, 2, 16, 200.0, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
+HOST = Host("A CPU", 2, 2, 16, "cpu", {"torch": "2", "numpy": "2", "python": "3"})
 NOISE = (0.0, 0.3, -0.3)  # of the seeds, the same for all arms
 
 

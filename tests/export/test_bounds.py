@@ -7,7 +7,7 @@ import pytest
 import torch
 from tiny_stages import CONTEXT
 
-from recon_cli.export.bounds import MOST_SPHERES, Room, bound_scene, describe_bounds, describe_loss
+from recon_cli.export.bounds import SPHERES, Room, bound_scene, describe_bounds, describe_loss
 from recon_cli.render import render
 from recon_cli.scene.backdrop import Backdrop, fibonacci_sphere
 from recon_cli.scene.camera import Camera, looking_at
@@ -102,7 +102,7 @@ def test_what_lies_outside_is_moved_inwards_and_looks_as_before(backdrop):
     bounded = bound_scene(scene, ROOM, CAMERAS, CONTEXT)
     inside = scene.means.norm(dim=1) <= ROOM.radius
     assert sphere(scene.with_sphere().means) > 30 * sphere(scene.means[inside])
-    assert sphere(bounded.means) <= MOST_SPHERES * sphere(scene.means[inside]) * (1 + 1e-5)
+    assert sphere(bounded.means) <= SPHERES[-1] * sphere(scene.means[inside]) * (1 + 1e-5)
     assert bounded.backdrop is None
     for before, after in zip(images(scene, CAMERAS), images(bounded, CAMERAS), strict=True):
         assert np.abs(after - before).mean() < 0.004  # the order of both sheets is kept
