@@ -102,10 +102,6 @@ _compute_options = options.stack([
     help="A tiny scene and few rounds: whether it works, not how fast.  [default: off]")
 @_option("--out", type=_FILE,
          help="Write all figures to FILE, as JSON.  [default: nowhere]")
-@_option(
-    "--compare", type=options.PathType(dir_okay=False), metavar="FILE",
-    help="Print the ratio of each figure of an earlier --out FILE to this run's.  "
-         "[default: none]")
 @options.verbosity
 @pass_call
 def bench(call: Call, /, **typed: Any) -> None:

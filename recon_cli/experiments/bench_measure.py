@@ -35,15 +35,10 @@ from recon_cli.train.gradient import gradient_step
 from recon_cli.train.optimizer import SplatOptimizer
 
 SCHEMA = "recon-bench"
-VERSION = 1  # goes up when a key changes its name or meaning
+VERSION = 2  # goes up when a key changes its name or meaning
 PASSES = ("forward", "backward", "step")
-# The figures of each backend in every scene for which --compare prints a ratio.
-FIGURES = (
-    *(f"{name}_ms" for name in PASSES), "image_error_max", "gradient_relative_error")
-_ADAM = "adam"  # the part of a step that updates the parameters
 
-Mark = Callable[[str], None]
-Work = Callable[[], Mapping[str, float]]  # returns the milliseconds of its parts
+Work = Callable[[], Mapping[str, float]]  # returns milliseconds by PASSES
 
 
 @dataclass(frozen=True)
@@ -51,9 +46,7 @@ class Speed:
     """The speed of a backend with some number of threads."""
 
     threads: int
-    # of whole passes, by PASSES (a step is forward, loss, backward, Adam), and of their parts, in
-    # order, as "pass: part"
-    times: dict[str, Timing]
+    times: dict[str, Timing]  # by PASSES; a step is forward, loss, backward, Adam
 
     @property
     def both_ms(self) -> float:
@@ -65,9 +58,7 @@ class Speed:
         return {
             "threads": self.threads,
             **{f"{name}_ms": self.times[name].ms for name in PASSES},
-            **{f"{name}_iqr_ms": self.times[name].iqr_ms for name in PASSES},
-            "stages": {name: asdict(timing) for name, timing in self.times.items()
-                       if name not in PASSES}}
+            **{f"{name}_iqr_ms": self.times[name].iqr_ms for name in PASSES}}
 
 
 @dataclass(frozen=True)
@@ -122,8 +113,8 @@ class BenchResult:
             } for name, scene in self.scenes.items()}}
 
 
-def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
-    """Returns a function that takes one training step at rates of 0 and marks its parts."""
+def training_step(scene: BenchScene, backend: str) -> Callable[[], None]:
+    """Returns a function that takes one training step at rates of 0."""
     still = replace(
         RunConfig(), means_rate=0.0, quats_rate=0.0, scales_rate=0.0, opacities_rate=0.0,
         sh_rate=0.0)
@@ -131,11 +122,9 @@ def training_step(scene: BenchScene, backend: str) -> Callable[[Mark], None]:
     compute = gradient_step(backend, scene.splats.means.device)
     view = TrainView(scene.camera, noise(scene))
 
-    def step(mark: Mark) -> None:
+    def step() -> None:
         compute(optimizer, view, StepOptions(scene.sh_degree, still.ssim_weight))
-        mark("gradients")
         optimizer.step(still.means_rate, sh_rest=scene.sh_degree > 0)
-        mark(_ADAM)
 
     return step
 
@@ -227,33 +216,25 @@ class _Measurement:
 
         def run() -> Mapping[str, float]:
             with use_threads(threads, backend):
-                return {**self._time_passes(backend), **self._time_step(step, backend)}
+                return {**self._time_passes(backend), **self._time_step(step)}
 
         return run
 
     def _time_passes(self, backend: str) -> dict[str, float]:
-        """Returns the milliseconds of both passes and of their parts."""
-        probe = instruments.Probe(backend)
-        with probe.watch():
-            watch = Stopwatch(self._plan.device)
-            output = _render(self._scene, registry.renderer(backend))
-            watch.mark("forward")
-            forward = probe.collect()
-            output.rgb.backward(self._scene.weights)  # type: ignore[no-untyped-call]
-            watch.mark("backward")
-            backward = probe.collect()
-        return {**_parts("forward", watch.ms["forward"], forward),
-                **_parts("backward", watch.ms["backward"], backward)}
+        """Returns the milliseconds of both passes."""
+        watch = Stopwatch(self._plan.device)
+        output = _render(self._scene, registry.renderer(backend))
+        watch.mark("forward")
+        output.rgb.backward(self._scene.weights)  # type: ignore[no-untyped-call]
+        watch.mark("backward")
+        return dict(watch.ms)
 
-    def _time_step(self, step: Callable[[Mark], None], backend: str) -> dict[str, float]:
-        """Returns the milliseconds of an optimization step and of its parts."""
-        probe = instruments.Probe(backend)
-        with probe.watch():
-            watch = Stopwatch(self._plan.device)
-            step(watch.mark)
-        parts = probe.collect()
-        parts.setdefault(_ADAM, watch.ms[_ADAM])
-        return _parts("step", sum(watch.ms.values()), parts)
+    def _time_step(self, step: Callable[[], None]) -> dict[str, float]:
+        """Returns the milliseconds of an optimization step."""
+        watch = Stopwatch(self._plan.device)
+        step()
+        watch.mark("step")
+        return dict(watch.ms)
 
 
 def _render(scene: BenchScene, renderer: Renderer) -> RenderOutput:
@@ -264,12 +245,3 @@ def _render(scene: BenchScene, renderer: Renderer) -> RenderOutput:
 def _render_and_back(scene: BenchScene, renderer: Renderer) -> None:
     """Runs both passes of a renderer."""
     _render(scene, renderer).rgb.backward(scene.weights)  # type: ignore[no-untyped-call]
-
-
-def _parts(whole: str, ms: float, parts: Mapping[str, float]) -> dict[str, float]:
-    """Returns the time of a pass under its name, of its parts, and the rest."""
-    times = {whole: ms}
-    if parts:
-        times |= {f"{whole}: {part}": part_ms for part, part_ms in parts.items()}
-        times[f"{whole}: rest"] = max(0.0, ms - sum(parts.values()))
-    return times

@@ -1,8 +1,4 @@
-"""Measuring on this machine: clocks, timings in alternated rounds, memory.
-
-A probe takes the time of each stage of the numba backend while it renders; it does not change the
-result.
-"""
+"""Measuring on this machine: clocks, timings in alternated rounds, memory."""
 
 from __future__ import annotations
 
@@ -19,7 +15,6 @@ import torch
 from recon_cli import machine
 from recon_cli.evaluation.scores import number
 from recon_cli.kernels.simd import LANES
-from recon_cli.kernels.thread_pool import pool
 
 # OpenMP's threads of the previous candidate keep spinning for some milliseconds after their work.
 _SETTLE_SECONDS = 0.03
@@ -169,35 +164,3 @@ def measure_memory(work: Callable[[], object], device: str) -> int:
         thread.join()
     added: int = max(peak, process.memory_info().rss) - start
     return added
-
-
-# names of kernels in the results on disk
-_STAGES = {"composite_backward": "decompose", "project_backward": "unproject"}
-
-
-class Probe:
-    """Times the stages of the numba backend while `watch`; of other backends, nothing."""
-
-    def __init__(self, backend: str) -> None:
-        self._numba = backend == "numba"
-        self._ms: dict[str, float] = {}  # by stage, since the last `collect`
-
-    @contextmanager
-    def watch(self) -> Iterator[None]:
-        """Times the parallel kernels within the block."""
-        if self._numba:
-            pool.observer = self._add
-        try:
-            yield
-        finally:
-            if self._numba:
-                pool.observer = None
-
-    def collect(self) -> dict[str, float]:
-        """Returns the milliseconds since the last call and starts anew."""
-        collected, self._ms = self._ms, {}
-        return collected
-
-    def _add(self, kernel_name: str, seconds: float) -> None:
-        stage = _STAGES.get(kernel_name, kernel_name)
-        self._ms[stage] = self._ms.get(stage, 0.0) + 1e3 * seconds

@@ -9,18 +9,14 @@ import pytest
 import torch
 
 from recon_cli.cli import main
-from recon_cli.experiments.bench_measure import FIGURES
+from recon_cli.experiments.bench_measure import PASSES
 from recon_cli.experiments.bench_scene import (
     Answer,
     SceneSize,
     accuracy,
-    answer,
     build_scene,
     oracle,
 )
-from recon_cli.experiments.instruments import Probe
-from recon_cli.kernels.thread_pool import pool
-from recon_cli.render import registry
 
 Said = pytest.CaptureFixture[str]
 TINY = SceneSize(200, 48, 32)
@@ -42,23 +38,16 @@ def test_quick_writes_the_promised_keys_and_the_errors_are_small(
     scene = record["scenes"]["room"]
     assert list(scene["backends"]) == ["numba", "torch"]
     for one in scene["backends"].values():
-        assert one.keys() >= set(FIGURES)
+        assert all(one[f"{name}_ms"] > 0 for name in PASSES)
         assert one["image_error_rms"] < IMAGE_RMS
         assert one["gradient_relative_error"] < GRADIENT
-    numba = scene["backends"]["numba"]
-    assert all(numba[name] > 0 for name in FIGURES if "error" not in name)
-    stages = numba["stages"]
-    assert {"forward: composite", "backward: decompose", "step: adam"} <= stages.keys()
-    for table in ("Figures", "Stages", "Error against float64"):
-        assert f"\n\n{table} (room" in out
-    assert pool.observer is None
+    rows = [line.split()[0] for line in out.splitlines() if line.startswith(("numba", "torch"))]
+    assert rows == ["numba", "torch"]
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [
     (["--backend", "cuda"], 6, "'cuda'"),
     (["--size", "640"], 2, "WIDTHxHEIGHT"),
-    (["--compare", "none.json"], 3, "cannot be read"),
-    (["--compare", "other.json"], 3, "has the schema none"),
     (["--out", "none/a"], 3, "does not exist"),
     (["--rounds", "0"], 2, "--rounds"),
 ])
@@ -69,25 +58,10 @@ def test_what_cannot_be_done_is_refused_before_anything_is_measured(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "recon_cli.experiments.rasterizer_benchmark.measure", lambda *_: pytest.fail("measured"))
-    Path("other.json").write_text("{}")
     assert main(["bench", *words]) == code
     err = capsys.readouterr().err
     assert said in err
-    assert "hint: " in err or words[0] == "--compare"
-
-
-def test_a_probe_changes_nothing_and_leaves_nothing_behind() -> None:
-    scene = build_scene(TINY, 3, "cpu")
-    draw = registry.renderer("numba")
-    plain = answer(scene, draw)
-    probe = Probe("numba")
-    with probe.watch():
-        seen = answer(scene, draw)
-    assert torch.equal(plain.image, seen.image)
-    assert all(torch.equal(plain.gradients[name], seen.gradients[name]) for name in seen.gradients)
-    assert {"composite", "decompose"} <= probe.collect().keys()
-    assert probe.collect() == {}
-    assert pool.observer is None
+    assert "hint: " in err
 
 
 def test_the_room_is_the_same_for_the_same_seed() -> None:
