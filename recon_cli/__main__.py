@@ -5,20 +5,17 @@ from __future__ import annotations
 import io
 import os
 import sys
-from typing import TYPE_CHECKING
+from typing import Any
 
 from recon_cli import signals
 from recon_cli.errors import WorkspaceError
 from recon_cli.processes import CHILD, end_with_parent, forget_options, protect_children
 
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
-
 
 class _StandardOutput(io.FileIO):
     """Standard output; what it cannot take is no fault of the disk of the workspace."""
 
-    def write(self, data: ReadableBuffer, /) -> int:
+    def write(self, data: Any, /) -> int:
         """Writes bytes; WorkspaceError where they cannot be written, but to a closed pipe.
 
         What comes later is dropped, for the buffer would try it once more at the end.

@@ -47,7 +47,7 @@ VERBS = {
     "status": ("workspace.status", "Show which stages are fresh, stale and why, or missing."),
     "clean": ("workspace.clean", "Free disk space."),
     "doctor": ("doctor.doctor", "Show versions, rasterizers, memory and disk."),
-    "bench": ("bench.bench", "Measure the rasterizers: speed against error."),
+    "bench": ("bench.bench", "Measure the rasterizers: speed and error."),
     "study": ("bench.study", "Repeat the paper's experiment: 3DGS against ours."),
 }
 

@@ -107,7 +107,7 @@ def develop(photo: Photo, plan: RawPlan) -> NDArray[np.uint8]:
     """Returns a RAW photo as upright sRGB, [H, W, 3]; InputError if it is, or was, damaged."""
     shot = plan.shots.get(photo.name)
     if shot is None:
-        raise InputError(plan.broken[photo.name])
+        raise InputError(plan.broken[photo.name], hint="")  # the reason says what helps
     try:
         with _open_corrected(photo.path) as (raw, warp):
             flip = raw.sizes.flip

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from recon_cli import progress
-from recon_cli.config.settings import GONE, SECTIONS
+from recon_cli.config.settings import GONE, SECTIONS, SUCCESSORS
 from recon_cli.errors import ExitCode
 from recon_cli.progress import hide_bars
 
@@ -223,8 +223,11 @@ def usage_hint(error: click.ClickException) -> str:
 def _gone(error: click.NoSuchOption) -> str:
     """Returns what to do about an option that earlier versions had; empty for any other."""
     name = error.option_name.lstrip("-").replace("-", "_")
-    gone = any(name in fields for fields in GONE.values())
-    return f"recon no longer has {error.option_name}: leave it out." if gone else ""
+    section = next((each for each, fields in GONE.items() if name in fields), None)
+    if section is None:
+        return ""
+    instead = SUCCESSORS.get((section, name), "Leave it out.")
+    return f"recon no longer has {error.option_name}. {instead}"
 
 
 def _setting(error: click.NoSuchOption) -> str:

@@ -194,14 +194,7 @@ def evaluate(
         click.echo(EXPLANATION)
 
 
-def _drop_backdrop(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
-    if value:
-        ctx.ensure_object(Call).settings.setdefault("export", {})["backdrop"] = "drop"
-
-
 @verb("export")
-@click.option(  # as it was once called
-    "--drop-backdrop", is_flag=True, hidden=True, expose_value=False, callback=_drop_backdrop)
 @options.stage(ExportConfig, renders=True)
 @pass_call
 def export(call: Call) -> None:

@@ -49,7 +49,7 @@ GONE: dict[str, dict[str, tuple[Any, ...]]] = {
     "export": {"drop_backdrop": (False,)},
 }
 
-_SUCCESSORS = {("export", "drop_backdrop"): 'Set export.backdrop to "drop" instead.'}
+SUCCESSORS = {("export", "drop_backdrop"): "Give --backdrop drop, in a file backdrop = 'drop'."}
 FILE = "recon.toml"  # in the workspace
 Settings = dict[str, dict[str, Any]]  # section -> field -> value, explicit ones only
 C = TypeVar("C", bound=StageConfig)
@@ -158,7 +158,7 @@ def check_names(section: str, names: Iterable[str], *, where: str) -> None:
         if name in GONE.get(section, {}):
             raise ConfigError(
                 f"{where} sets {section}.{name}, which recon no longer has.",
-                hint=_SUCCESSORS.get((section, name)) or (
+                hint=SUCCESSORS.get((section, name)) or (
                     f"Delete the line {name} = ... below [{section}] in a file, and leave out "
                     f"--set {section}.{name}."))
         if name not in known:

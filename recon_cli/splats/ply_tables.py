@@ -144,7 +144,8 @@ def read_elements(
             else:
                 promised = sum(count * row.itemsize for _, count, row in rows)
                 # a row or a property that the header lacks takes at least as much
-                least = max((min(row.itemsize, count) for _, count, row in rows), default=1)
+                least = max((max(1, min(row.itemsize, count)) for _, count, row in rows),
+                            default=1)
                 fits = promised <= size and not (exact and size >= promised + least)
             if not fits:
                 listed = ", ".join(

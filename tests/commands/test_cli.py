@@ -360,7 +360,7 @@ def test_help_of_train_fits_on_a_screen(
     ("train", "--means-rate"), ("train", "--densify-every"), ("train", "--min-opacity"),
     ("train", "--mid"), ("train", "--ssim-weight"), ("train", "--checkpoint-every"),
     ("train", "--batch-views"), ("export", "--spz-version"), ("render", "--crf"),
-    ("render", "--codec"), ("bench", "--rounds"), ("bench", "--markdown"), ("study", "--clock"),
+    ("render", "--codec"), ("bench", "--rounds"), ("bench", "--size"), ("study", "--clock"),
     ("study", "--log-format"),
 ])
 def test_options_for_experts_are_on_the_second_page_of_help(

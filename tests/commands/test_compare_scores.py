@@ -82,7 +82,7 @@ def test_a_file_scores_what_the_workspace_it_came_from_scores(room, tmp_path, ca
 
 def test_a_file_that_was_handed_out_in_another_frame_scores_the_same(room, tmp_path, capsys):
     out = shutil.copytree(room / "a", tmp_path / "turned")
-    assert main(["export", "-w", str(out), "--up", "y"]) == 0
+    assert main(["export", "-w", str(out), "--up", "y", "--backdrop", "keep"]) == 0
     found = as_json(compared(
         capsys, room / "a", out / "export" / "splats.ply", "-w", room / "a", "--form", "json"))
     _, pruned, file = found["models"]

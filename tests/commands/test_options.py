@@ -24,7 +24,7 @@ from recon_cli.errors import ConfigError
 
 EVERY_OPTION = [
     pytest.param(parameter, id=f"{verb} {parameter.opts[0]}")
-    for verb, command in [*cli.commands.items(), *cli.commands["bench"].commands.items()]
+    for verb, command in cli.commands.items()
     for parameter in command.params if isinstance(parameter, click.Option)
 ]
 EVERY_FIELD = [

@@ -16,7 +16,7 @@ def full(monkeypatch, tmp_path):
     def fail(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", fail)
+    monkeypatch.setattr(kernel._CheckedFiles, "save", fail)
 
 
 @pytest.mark.usefixtures("full")

@@ -128,7 +128,7 @@ def test_two_groups_that_meet_in_one_panorama_have_scales_of_their_own(captured)
     assert verdict.scale.error > 1
     assert set(verdict.scale.sides) == {job.names[:5], (*job.names[6:], job.names[5])} or set(
         verdict.scale.sides) == {job.names[6:], (*job.names[:5], job.names[5])}
-    assert any("The scale of the" in problem for problem in verdict.problems)
+    assert any("on one side of the cut" in problem for problem in verdict.problems)
 
 
 def test_points_that_both_groups_see_give_them_one_scale(captured):

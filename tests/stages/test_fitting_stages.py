@@ -136,7 +136,7 @@ def test_nothing_to_train_on_is_an_error(inputs, tmp_path):
 
 
 def test_export_hands_out_the_pruned_model_where_there_is_one(inputs, tmp_path):
-    summary = run(export, ExportConfig(), inputs, tmp_path / "a")
+    summary = run(export, ExportConfig(backdrop="keep"), inputs, tmp_path / "a")
     assert summary.model == "pruned"
     assert (tmp_path / "a" / "splats.ply").read_bytes() == (
         inputs.folders["prune"] / "splats.ply").read_bytes()

@@ -131,7 +131,8 @@ def test_a_file_name_cannot_pass_for_a_message(tmp_path, notices):
     (folder / "a\nerror: \x1b[31mb.jpg").touch()
     take(folder, tmp_path / "out")
     assert notices() == [
-        r"A photo is left out: a\nerror: \x1b[31mb.jpg cannot be read: it is empty (0 bytes)."]
+        r"A photo is left out: a\nerror: \x1b[31mb.jpg cannot be read: it is empty (0 bytes). "
+        "Copy it from the camera again, or leave it out."]
 
 
 def test_photos_in_an_inner_folder_are_taken_and_their_masks_beside_it(tmp_path, notices):
