@@ -162,7 +162,7 @@ def test_one_view_to_train_on_is_too_few(inputs, tmp_path):
     for i, frame in enumerate(frames["frames"]):
         frame["held_out"] = i > 0
     (folder / "frames.json").write_text(json.dumps(frames))
-    with pytest.raises(TrainingError, match="1 views are left") as caught:
+    with pytest.raises(TrainingError, match="Only 1 view") as caught:
         run(OPEN, StageInputs({**inputs.folders, "ingest": folder}), tmp_path / "out")
     assert "--holdout" in caught.value.hint
 

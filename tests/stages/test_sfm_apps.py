@@ -10,7 +10,6 @@ from app_shots import shots
 from ingest_media import take
 from sfm_inputs import run
 
-from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images
 from recon_cli.workspace.records import read_frame_list
 
@@ -45,19 +44,13 @@ def test_kept_poses_end_in_metres_with_z_up(name, shared_data, tmp_path):
             assert motion[2, 2] > np.cos(np.radians(3))
 
 
-def test_depth_that_contradicts_the_poses_ends_sfm_unless_that_is_accepted(shared_data, tmp_path):
+def test_depth_that_contradicts_the_poses_is_no_source_of_the_scale(shared_data, tmp_path):
     # 30% is too little to be a unit, and too much for either to be right.
     taken = [dataclasses.replace(shot, depth=1.3 * shot.depth) for shot in shots(
         shared_data / "rooms" / "office", count=20, step=4, factor=1)]
     APPS["nerfcapture"].write(tmp_path / "capture", taken)
     take(tmp_path / "capture", tmp_path / "ingest")
     shutil.copytree(tmp_path / "ingest" / "frames", tmp_path / "denoise" / "frames")
-    words = r"by the tracked poses a unit has .*; by sensor depth"
-    with pytest.raises(SfmError, match=words) as caught:
-        run(tmp_path, tmp_path / "sfm")
-    assert caught.value.exit_code == 5
-    assert "--scale-between" in caught.value.hint
-    # What is mapped stays, so that the command of the hint takes seconds.
-    summary = run(tmp_path, tmp_path / "sfm", accept_weak=True)
-    assert not summary.world.evidence.metres
-    assert len(summary.world.evidence.scale_sources) == 2
+    evidence = run(tmp_path, tmp_path / "sfm").world.evidence
+    assert evidence.metres
+    assert len(evidence.scale_sources) == 1  # the poses
