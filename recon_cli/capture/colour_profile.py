@@ -62,7 +62,9 @@ def read_coding(path: Path, image: Image.Image) -> Coding | None:
         return None
     exif = image.getexif()
     space = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.ColorSpace)
-    index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)
+    index = None
+    with suppress(KeyError):  # Pillow 11.1 raises it where there is no such directory
+        index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)
     if not image.info.get("icc_profile") and image.mode in ("RGB", "RGBA") and (
             space == _ADOBE_SPACE or (space == _UNCALIBRATED and index == _ADOBE_INDEX)):
         return Coding(ADOBE_RGB, None)

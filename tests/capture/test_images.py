@@ -361,7 +361,8 @@ def test_memory_and_not_pillow_sets_the_limit(tmp_path, monkeypatch, recwarn, na
 
 def test_jpeg_xl_is_named_where_its_package_is_not_installed(tmp_path, monkeypatch):
     (tmp_path / "a.jxl").write_bytes(b"\xff\x0a" + bytes(100))
-    monkeypatch.setattr(images, "_formats", lambda: tuple(set(images.FORMATS) - {"JXL", "HEIF"}))
+    known = tuple(name for name in images._formats() if name != "JXL")
+    monkeypatch.setattr(images, "_formats", lambda: known)
     with pytest.raises(InputError, match="JPEG XL") as error:
         inspect_photo(tmp_path / "a.jxl")
     assert "pillow-jxl-plugin" in error.value.hint
