@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-from setuptools import setup
-
 _BLOB = "https://github.com/recon-cli/recon/blob/main"
 _RAW = "https://raw.githubusercontent.com/recon-cli/recon/main"
 _LINK = re.compile(r"(?P<picture>!?)\[(?P<text>[^\[\]]*)\]\((?P<path>(?!https?:)[^#)][^)]*)\)")
@@ -18,6 +16,8 @@ def absolute(text: str) -> str:
 
 
 if __name__ == "__main__":
+    from setuptools import setup
+
     setup(
         long_description=absolute(
             Path(__file__).with_name("README.md").read_text(encoding="utf-8")),
