@@ -240,7 +240,7 @@ def decide(
     others = [pycolmap.Reconstruction(path) for path in sorted((kept / "others").glob("*"))]
     verdict = examine(model, job.database, job.names, sharpness=job.sharpness, times=job.times,
                       lenses=job.unknown_lenses)
-    held = [{model.image(i).name for i in each.reg_image_ids()} for each in (model, *others)]
+    held = [{each.image(i).name for i in each.reg_image_ids()} for each in (model, *others)]
     apart = tuple(tuple(sorted(names - held[0])) for names in held[1:])
     candidate = ModelCandidate(model, verdict, apart, read_json(kept / "rejected.json"))
     try:
