@@ -176,8 +176,8 @@ def _ask_floor(cut: _Cut, heights: NDArray[np.float64]) -> _Cut:
 
     Both are taken for normal: what is most likely wrong then, or its deviation if that is more.
     """
-    place = cut.ends[1]
-    step = compare_heights(heights, place) if cut.side[:place].all() else None
+    changes = np.flatnonzero(np.diff(cut.side)) + 1
+    step = compare_heights(heights, int(changes[0])) if len(changes) == 1 else None
     if step is None:
         return cut
     share = cut.error**2 / (cut.error**2 + SPREAD**2)
