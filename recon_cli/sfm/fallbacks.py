@@ -29,6 +29,7 @@ from recon_cli.sfm import (
     parts,
     skeleton,
     wide_lens,
+    xfeat_weights,
 )
 from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
 from recon_cli.sfm.limits import ENOUGH_FRAMES, MIN_FRAMES, MIN_ONE_POINT, MIN_PAIR_INLIERS
@@ -41,6 +42,7 @@ from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 OTHERS = "others"  # in the folder of an attempt: its models that hold other frames, by number
+BRIDGE = "bridge"  # the fallback with learned features, which has a database of its own
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW_PHOTOS = 30
@@ -79,6 +81,7 @@ class MapperAttempt(JsonRecord):
     reprojection_error_px: float | None = None
     # Models that fit its cameras clearly better, by number; only where another attempt may use them
     lenses: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    thin: bool = False
 
     @property
     def models(self) -> list[int]:
@@ -164,9 +167,12 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
             log.finish(fallback.name, attempt, job.attempts / fallback.name)
         attempts.append(attempt)
         if not attempt.skipped:
-            reason = attempt.shortfall
-            if not reason:
+            bridge = _with_bridge(job, attempts, ways)
+            reason = attempt.shortfall or (bridge.reason if bridge else "")
+            if not reason or (fallback.name == BRIDGE and not attempts[-2].shortfall):
                 break
+            if bridge is not None:
+                ways.insert(0, bridge)
             if attempt.lenses:
                 ways.insert(0, _with_lenses(attempt.lenses))
             if ways and attempt.seconds > 60 * MINUTES_TOLD:
@@ -216,6 +222,31 @@ def _with_lenses(models: Mapping[str, str]) -> Fallback:
     """Returns the way to a model with other camera models, by the numbers of the cameras."""
     return Fallback(wide_lens.OTHER, "", lambda *_: set(), lambda job, report: (
         wide_lens.map_lenses(job, report, {int(number): models[number] for number in models})))
+
+
+def _with_bridge(
+    job: MappingJob, attempts: Sequence[MapperAttempt], ways: Sequence[Fallback]
+) -> Fallback | None:
+    """Returns the way to a model of photos with learned features, where these may help.
+
+    That is once all pairs are matched that are to be, and the model falls short or is thin.
+    """
+    best = best_attempt(attempts)
+    if (job.pairs != "auto" or job.segments or job.last == "model" or job.panoramas
+            or skeleton.is_continuous(job) or not xfeat_weights.are_installed()
+            or (ways and ways[0].name in _PAIRS) or best is None
+            or {BRIDGE, wide_lens.ATTEMPT, wide_lens.OTHER}.intersection(
+                attempt.name for attempt in attempts)):
+        return None
+    if not best.shortfall and not best.thin:
+        return None
+    from recon_cli.sfm import bridge  # imports torch
+
+    parts = [best.registered, *best.apart]
+    return Fallback(
+        BRIDGE, "the model rests on few matches", lambda *_: set(),
+        lambda job, report: bridge.map_bridged(
+            job, report, parts, best.registered))
 
 
 def may_change_lenses(job: MappingJob, before: Collection[str]) -> bool:
@@ -374,7 +405,7 @@ def _publish_best(
 def _with_own_matches(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
     own = job.attempts / name / skeleton.MATCHES_DB
-    has_own = name in (TRACKS, wide_lens.ATTEMPT, wide_lens.OTHER) or (
+    has_own = name in (TRACKS, BRIDGE, wide_lens.ATTEMPT, wide_lens.OTHER) or (
         name == SEGMENTS and job.tracks is not None)
     return dataclasses.replace(job, matches_db=own) if has_own else job
 
