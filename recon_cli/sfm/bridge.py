@@ -85,13 +85,18 @@ def map_bridged(
 
     `job.matches_db` names the database that is written and mapped from; see `choose_pairs`.
     """
+    weights = xfeat_weights.load_weights()
+    if weights is None:
+        report.tell("The learned features are damaged and not used: "
+                    f"`{xfeat_weights.COMMAND}` gets them anew.")
+        return []
     source = replace(job, matches_db=None)
     pairs = choose_pairs(source, parts, thin)
     database.remove(job.database)
     shutil.copyfile(source.database, job.database)
     verified = matching.read_verified(source.database)
     report.phase("bridge", len(pairs))
-    photos = _read_photos(job, sorted({name for pair in pairs for name in pair}))
+    photos = _read_photos(job, Network(weights), sorted({name for pair in pairs for name in pair}))
     bridges = 0
     with pycolmap.Database.open(job.database) as opened:
         for photo in photos.values():
@@ -114,11 +119,10 @@ def map_bridged(
     return mapper.map_incrementally(job, report) if bridges else []
 
 
-def _read_photos(job: MappingJob, names: Sequence[str]) -> dict[str, PhotoFeatures]:
+def _read_photos(
+    job: MappingJob, network: Network, names: Sequence[str]
+) -> dict[str, PhotoFeatures]:
     """Returns photos by name, with the learned features found in them."""
-    weights = xfeat_weights.load_weights()
-    assert weights is not None  # else the fallback is not listed
-    network = Network(weights)
 
     def find(name: str) -> LearnedFeatures:
         mask = None

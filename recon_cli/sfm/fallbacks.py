@@ -42,6 +42,7 @@ from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 OTHERS = "others"  # in the folder of an attempt: its models that hold other frames, by number
+COARSE = "coarse"  # the fallback for photos that begins with their coarsest features
 BRIDGE = "bridge"  # the fallback with learned features, which has a database of its own
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
@@ -81,7 +82,7 @@ class MapperAttempt(JsonRecord):
     reprojection_error_px: float | None = None
     # Models that fit its cameras clearly better, by number; only where another attempt may use them
     lenses: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    thin: bool = False
+    thin: bool = False  # its cameras are known too roughly
 
     @property
     def models(self) -> list[int]:
@@ -112,7 +113,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
     elif count > FEW_PHOTOS and not job.split and not job.segments and not job.panoramas:
-        ways = (Fallback("coarse", f"the coarsest features of {count} frames show overlap",
+        ways = (Fallback(COARSE, f"the coarsest features of {count} frames show overlap",
                          skeleton.choose_coarse_pairs, skeleton.complete_coarse), *ways)
     if job.segments:
         joined = Fallback(
@@ -167,12 +168,12 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
             log.finish(fallback.name, attempt, job.attempts / fallback.name)
         attempts.append(attempt)
         if not attempt.skipped:
-            bridge = _with_bridge(job, attempts, ways)
-            reason = attempt.shortfall or (bridge.reason if bridge else "")
-            if not reason or (fallback.name == BRIDGE and not attempts[-2].shortfall):
-                break
+            bridge = _with_bridge(job, attempts, ways, report)
             if bridge is not None:
                 ways.insert(0, bridge)
+            elif any(made.registered and not made.shortfall for made in attempts):
+                break
+            reason = attempt.shortfall or "the photos share few matches"
             if attempt.lenses:
                 ways.insert(0, _with_lenses(attempt.lenses))
             if ways and attempt.seconds > 60 * MINUTES_TOLD:
@@ -225,28 +226,32 @@ def _with_lenses(models: Mapping[str, str]) -> Fallback:
 
 
 def _with_bridge(
-    job: MappingJob, attempts: Sequence[MapperAttempt], ways: Sequence[Fallback]
+    job: MappingJob, attempts: Sequence[MapperAttempt], ways: Sequence[Fallback], report: Reporter
 ) -> Fallback | None:
     """Returns the way to a model of photos with learned features, where these may help.
 
-    That is once all pairs are matched that are to be, and the model falls short or is thin.
+    That is after the last attempt that matches other pairs, if the model falls short or lacks
+    frames, even such that SIFT matches to nothing, or if it is thin. Where the features are not
+    installed, the user is told how to get them.
     """
-    best = best_attempt(attempts)
-    if (job.pairs != "auto" or job.segments or job.last == "model" or job.panoramas
-            or skeleton.is_continuous(job) or not xfeat_weights.are_installed()
-            or (ways and ways[0].name in _PAIRS) or best is None
-            or {BRIDGE, wide_lens.ATTEMPT, wide_lens.OTHER}.intersection(
-                attempt.name for attempt in attempts)):
+    last, before = attempts[-1], {attempt.name for attempt in attempts}
+    lacks = last.shortfall or len(last.registered) < ENOUGH_FRAMES * len(job.names)
+    may_help = last.thin or (lacks and not (ways and ways[0].name in _PAIRS))
+    if (not may_help or last.name not in (COARSE, *_PAIRS) or job.pairs != "auto" or job.segments
+            or job.panoramas or job.last == "model"  # a segment, whose keypoints are all that is
+            or skeleton.is_continuous(job) or before & {BRIDGE, "relaxed", wide_lens.ATTEMPT}):
         return None
-    if not best.shortfall and not best.thin:
+    if not xfeat_weights.are_installed():
+        report.tell("These photos are few or far apart. Learned features may match them where SIFT "
+                    f"cannot: `{xfeat_weights.COMMAND}` gets them, then run `recon sfm --again`.")
         return None
     from recon_cli.sfm import bridge  # imports torch
 
-    parts = [best.registered, *best.apart]
-    return Fallback(
-        BRIDGE, "the model rests on few matches", lambda *_: set(),
-        lambda job, report: bridge.map_bridged(
-            job, report, parts, best.registered))
+    best = best_attempt(attempts)
+    parts = [best.registered, *best.apart] if best else []
+    thin = best.registered if best and best.thin else ()
+    return Fallback(BRIDGE, "", lambda *_: set(), lambda job, report: (
+        bridge.map_bridged(job, report, parts, thin)))
 
 
 def may_change_lenses(job: MappingJob, before: Collection[str]) -> bool:
@@ -305,12 +310,16 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     """Returns the attempt with the best model: many frames that are strongly connected.
 
     A frame counts by the agreement across the weakest cut of its model, and at most as in a broken
-    model where another check failed; in a tie of 1% the smaller reprojection error decides, then
-    the earlier attempt.
+    model where another check failed or its cameras are known roughly; in a tie of 1% the smaller
+    reprojection error decides, then the earlier attempt. Bridges that give no trusted model are
+    worth nothing.
     """
     def quality(attempt: MapperAttempt) -> tuple[float, float]:
+        if attempt.name == BRIDGE and not attempt.trusted:
+            return 0.0, 0.0
         link = attempt.weak_link if attempt.weak_link is not None else float(attempt.trusted)
-        link = link if attempt.trusted else min(link, MIN_ONE_POINT)
+        if not attempt.trusted or attempt.thin:
+            link = min(link, MIN_ONE_POINT)
         most = max(len(other.registered) for other in attempts)
         return (round(len(attempt.registered) / most * (0.5 + 0.5 * link), 2),
                 -(attempt.reprojection_error_px or 0.0))
