@@ -61,16 +61,16 @@ def choose_pairs(
 ) -> set[Pair]:
     """Returns the pairs that SIFT matched too little and that a bridge would help.
 
-    These lie across two of the `parts` that models hold, have an image without a place, or lie
-    within a `thin` part. Each image is paired with those that look most like it, and with the
-    nearest by name.
+    These lie across two of the `parts` that models hold, have an image without a place, or one of
+    those whose place is `thin`. Each image is paired with those that look most like it, and with
+    the nearest by name.
     """
     part_of = {name: index for index, names in enumerate(parts) for name in names}
     verified = matching.read_verified(job.database)
 
     def helps(first: str, second: str) -> bool:
         apart = first not in part_of or part_of[first] != part_of.get(second)
-        return apart or (first in thin and second in thin)
+        return apart or first in thin or second in thin
 
     near = skeleton.near_pairs(job, skeleton.ALWAYS)
     alike = matching.similar_pairs(job.database, job.names, seed=job.seed, besides=near)

@@ -32,7 +32,13 @@ from recon_cli.sfm import (
     xfeat_weights,
 )
 from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
-from recon_cli.sfm.limits import ENOUGH_FRAMES, MIN_FRAMES, MIN_ONE_POINT, MIN_PAIR_INLIERS
+from recon_cli.sfm.limits import (
+    ENOUGH_FRAMES,
+    FEW_PAIR_MATCHES,
+    MIN_FRAMES,
+    MIN_ONE_POINT,
+    MIN_PAIR_INLIERS,
+)
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.time_estimate import format_minutes
@@ -82,7 +88,7 @@ class MapperAttempt(JsonRecord):
     reprojection_error_px: float | None = None
     # Models that fit its cameras clearly better, by number; only where another attempt may use them
     lenses: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    thin: bool = False  # its cameras are known too roughly
+    thin: tuple[str, ...] = ()  # frames of photos that few points place, see `list_thin`
 
     @property
     def models(self) -> list[int]:
@@ -237,9 +243,8 @@ def _with_bridge(
     last, before = attempts[-1], {attempt.name for attempt in attempts}
     lacks = last.shortfall or len(last.registered) < ENOUGH_FRAMES * len(job.names)
     may_help = last.thin or (lacks and not (ways and ways[0].name in _PAIRS))
-    if (not may_help or last.name not in (COARSE, *_PAIRS) or job.pairs != "auto" or job.segments
-            or job.panoramas or job.last == "model"  # a segment, whose keypoints are all that is
-            or skeleton.is_continuous(job) or before & {BRIDGE, "relaxed", wide_lens.ATTEMPT}):
+    if (not may_help or last.name not in (COARSE, *_PAIRS) or not may_bridge(job)
+            or before & {BRIDGE, "relaxed", wide_lens.ATTEMPT}):
         return None
     if not xfeat_weights.are_installed():
         report.tell("These photos are few or far apart. Learned features may match them where SIFT "
@@ -249,9 +254,29 @@ def _with_bridge(
 
     best = best_attempt(attempts)
     parts = [best.registered, *best.apart] if best else []
-    thin = best.registered if best and best.thin else ()
+    thin = best.thin if best else ()
     return Fallback(BRIDGE, "", lambda *_: set(), lambda job, report: (
         bridge.map_bridged(job, report, parts, thin)))
+
+
+def may_bridge(job: MappingJob) -> bool:
+    """Returns whether learned features may be asked: of photos that are mapped as one."""
+    is_segment = job.last == "model"  # has the keypoints that the others have
+    return job.pairs == "auto" and not (
+        is_segment or job.segments or job.panoramas or skeleton.is_continuous(job))
+
+
+def list_thin(model: pycolmap.Reconstruction) -> tuple[str, ...]:
+    """Returns the images that few points place which two others show; none where these are few.
+
+    Nothing else contradicts a wrong place: 13 photos were trusted that were 12 cm off in a room,
+    by images with 44 and more such points.
+    """
+    firm = {number for number, point in model.points3D.items() if point.track.length() > 2}
+    images = [model.image(number) for number in model.reg_image_ids()]
+    thin = sorted(image.name for image in images if sum(
+        point.point3D_id in firm for point in image.get_observation_points2D()) < FEW_PAIR_MATCHES)
+    return tuple(thin) if len(thin) > (1 - ENOUGH_FRAMES) * len(images) else ()
 
 
 def may_change_lenses(job: MappingJob, before: Collection[str]) -> bool:
@@ -310,15 +335,17 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     """Returns the attempt with the best model: many frames that are strongly connected.
 
     A frame counts by the agreement across the weakest cut of its model, and at most as in a broken
-    model where another check failed or its cameras are known roughly; in a tie of 1% the smaller
-    reprojection error decides, then the earlier attempt. Bridges that give no trusted model are
-    worth nothing.
+    model where another check failed, or where bridges were tried as it was thin; in a tie of 1%
+    the smaller reprojection error decides, then the earlier attempt. Bridges that give no trusted
+    model are worth nothing.
     """
+    bridged = any(attempt.name == BRIDGE for attempt in attempts)
+
     def quality(attempt: MapperAttempt) -> tuple[float, float]:
         if attempt.name == BRIDGE and not attempt.trusted:
             return 0.0, 0.0
         link = attempt.weak_link if attempt.weak_link is not None else float(attempt.trusted)
-        if not attempt.trusted or attempt.thin:
+        if not attempt.trusted or (bridged and attempt.thin):
             link = min(link, MIN_ONE_POINT)
         most = max(len(other.registered) for other in attempts)
         return (round(len(attempt.registered) / most * (0.5 + 0.5 * link), 2),
@@ -348,7 +375,8 @@ def _try_fallback(
         database.seal(job.database)
     job = _with_own_matches(job, fallback.name)
     candidate = merge_models.best_model(
-        job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS)
+        job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS,
+        both_ways=fallback.name == BRIDGE)
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
         return MapperAttempt(fallback.name, reason, seconds), None
@@ -365,7 +393,8 @@ def _try_fallback(
         candidate.apart, candidate.rejected,
         candidate.verdict.trusted, candidate.verdict.weakest_cut.share,
         candidate.model.compute_mean_reprojection_error(),
-        {str(lens.camera): lens.better for lens in found})
+        {str(lens.camera): lens.better for lens in found},
+        list_thin(candidate.model) if may_bridge(job) else ())
     return attempt, candidate
 
 

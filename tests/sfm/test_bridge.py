@@ -166,7 +166,9 @@ def test_pairs_across_parts_and_of_unplaced_frames_are_asked_where_sift_has_few(
     for first, second in pairs:
         assert placed.get(first, first) != placed.get(second, second)
     assert not bridge.choose_pairs(job, [names], ())
-    assert all(names[10] <= second for _, second in bridge.choose_pairs(job, [names], names))
+    thin = bridge.choose_pairs(job, [names], names[-1:])
+    assert thin
+    assert all(names[-1] in pair for pair in thin)
 
 
 @pytest.fixture
@@ -258,12 +260,25 @@ def test_a_thin_model_is_bridged_though_nothing_else_is_wrong(without_some, monk
         reprojection_error_px=0.2)
     report = Reporter(io.BytesIO())
     assert fallbacks._with_bridge(job, [sound], [], report) is None
-    thin = replace(sound, thin=True)
+    thin = replace(sound, thin=job.names[-3:])
     assert fallbacks._with_bridge(job, [thin], [], report) is not None
     bridged = replace(sound, name="bridge", weak_link=0.9, reprojection_error_px=0.4)
     assert fallbacks.best_attempt([thin, bridged]) is bridged
-    assert fallbacks.best_attempt([thin, replace(bridged, thin=True)]) is thin
+    assert fallbacks.best_attempt([thin, replace(bridged, thin=job.names[-3:])]) is thin
     assert fallbacks.best_attempt([thin, replace(bridged, registered=job.names[:9])]) is thin
+
+
+def test_images_are_thin_that_few_points_place_which_two_others_show(tmp_path):
+    few = fallbacks.FEW_PAIR_MATCHES
+    _, firm = make_capture(tmp_path / "firm", frames=12, points=few)
+    assert fallbacks.list_thin(firm) == ()
+    _, thin = make_capture(tmp_path / "thin", frames=12, points=few - 1)
+    assert len(fallbacks.list_thin(thin)) == 12
+    names = [image.name for image in firm.images.values()]
+    for name in names[:2]:
+        image = firm.find_image_with_name(name)
+        firm.delete_observation(image.image_id, 0)
+        assert fallbacks.list_thin(firm) == (() if name == names[0] else tuple(sorted(names[:2])))
 
 
 def test_bridges_that_give_no_trusted_model_replace_nothing():
