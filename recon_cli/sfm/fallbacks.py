@@ -50,6 +50,7 @@ TRACKS = "tracks"  # the fallback that has a database of its own
 OTHERS = "others"  # in the folder of an attempt: its models that hold other frames, by number
 COARSE = "coarse"  # the fallback for photos that begins with their coarsest features
 BRIDGE = "bridge"  # the fallback with learned features, which has a database of its own
+RELAXED_BRIDGE = "bridge relaxed"  # with the database of the former, and lower thresholds
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW_PHOTOS = 30
@@ -177,6 +178,9 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
             bridge = _with_bridge(job, attempts, ways, report)
             if bridge is not None:
                 ways.insert(0, bridge)
+            elif fallback.name == BRIDGE and attempt.registered and attempt.shortfall:
+                ways.insert(0, Fallback(
+                    RELAXED_BRIDGE, "", lambda *_: set(), mapper.map_relaxed))
             elif any(made.registered and not made.shortfall for made in attempts):
                 break
             reason = attempt.shortfall or "the photos share few matches"
@@ -342,7 +346,7 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     bridged = any(attempt.name == BRIDGE for attempt in attempts)
 
     def quality(attempt: MapperAttempt) -> tuple[float, float]:
-        if attempt.name == BRIDGE and not attempt.trusted:
+        if attempt.name in (BRIDGE, RELAXED_BRIDGE) and not attempt.trusted:
             return 0.0, 0.0
         link = attempt.weak_link if attempt.weak_link is not None else float(attempt.trusted)
         if not attempt.trusted or (bridged and attempt.thin):
@@ -376,7 +380,7 @@ def _try_fallback(
     job = _with_own_matches(job, fallback.name)
     candidate = merge_models.best_model(
         job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS,
-        both_ways=fallback.name == BRIDGE)
+        both_ways=fallback.name in (BRIDGE, RELAXED_BRIDGE))
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
         return MapperAttempt(fallback.name, reason, seconds), None
@@ -442,8 +446,8 @@ def _publish_best(
 
 def _with_own_matches(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
-    own = job.attempts / name / skeleton.MATCHES_DB
-    has_own = name in (TRACKS, BRIDGE, wide_lens.ATTEMPT, wide_lens.OTHER) or (
+    own = job.attempts / (BRIDGE if name == RELAXED_BRIDGE else name) / skeleton.MATCHES_DB
+    has_own = name in (TRACKS, BRIDGE, RELAXED_BRIDGE, wide_lens.ATTEMPT, wide_lens.OTHER) or (
         name == SEGMENTS and job.tracks is not None)
     return dataclasses.replace(job, matches_db=own) if has_own else job
 

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 from facts import assert_facts
-from synthetic import center_error, make_capture
+from synthetic import center_error, make_capture, part
 
 from recon_cli.sfm import bridge, database, fallbacks, mapper, matching, xfeat_weights
 from recon_cli.sfm.bridge import PhotoFeatures, find_bridge, match_rows, match_sift
@@ -239,6 +239,29 @@ def test_a_bridge_that_makes_nothing_better_leaves_the_old_model(without_some, m
     result, _ = build(job)
     assert [(item.name, item.kept) for item in result.attempts][:2] == [
         ("exhaustive", True), ("bridge", False)]
+
+
+@pytest.mark.usefixtures("bridges")
+def test_bridges_that_place_too_few_are_mapped_again_with_lower_thresholds(
+    without_some, monkeypatch
+):
+    job, truth = without_some
+    real, databases = mapper.map_relaxed, []
+
+    def relaxed(job, report):
+        databases.append(job.database)
+        return real(job, report)
+
+    monkeypatch.setattr(mapper, "map_relaxed", relaxed)
+    find = mapper.map_incrementally
+    monkeypatch.setattr(mapper, "map_incrementally", lambda job, report: (
+        [part(truth, job.names[:12])] if job.matches_db else find(job, report)))
+    result, _ = build(job)
+    assert [(item.name, item.registered) for item in result.attempts] == [
+        ("exhaustive", 10), ("bridge", 12), ("bridge relaxed", 20)]
+    assert databases == [job.attempts / "bridge" / "linked.db"]
+    assert sum(item.kept for item in result.attempts) == 1
+    assert result.attempts[2].kept
 
 
 @pytest.mark.parametrize("change", [
