@@ -30,6 +30,7 @@ RUN if [ "$TORCH" = cuda ]; then \
     && useradd --uid 1000 --create-home recon \
     && install -d -o recon -g recon /data /cache
 COPY --from=build /opt/recon /opt/recon
+# `docker run -v recon-cache:/cache recon setup bridge` keeps its weights in that volume.
 ENV PATH=/opt/recon/bin:$PATH \
     RECON_CACHE_DIR=/cache \
     PYTHONDONTWRITEBYTECODE=1 \

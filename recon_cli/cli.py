@@ -46,6 +46,7 @@ VERBS = {
     "demo": ("stages.demo", "Run every stage on the bundled room video."),
     "status": ("workspace.status", "Show which stages are fresh, stale and why, or missing."),
     "clean": ("workspace.clean", "Free disk space."),
+    "setup": ("setup.setup", "Get the learned features that match photos taken far apart."),
     "doctor": ("doctor.doctor", "Show versions, rasterizers, memory and disk."),
     "bench": ("bench.bench", "Measure the rasterizers: speed and error."),
     "study": ("bench.study", "Repeat the paper's experiment: 3DGS against ours."),

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from browser import WatchedPage
     from playwright.sync_api import Browser
 
+    from recon_cli.sfm.xfeat import Network
+
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels are kept from one run of the tests to the next, but not among the user's own.
 os.environ.setdefault("RECON_CACHE_DIR", str(ROOT / ".pytest_cache" / "recon"))
@@ -112,6 +114,30 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the captures in ../shared/data are not here")
     return folder
+
+
+@pytest.fixture(scope="session")
+def learned_weights(build_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """A folder for RECON_CACHE_DIR with the weights that `recon setup bridge` downloads."""
+    from recon_cli import cli
+
+    def fill(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("RECON_CACHE_DIR", str(folder))
+            assert cli.main(["setup", "bridge"]) == 0
+
+    return build_once("weights", fill)
+
+
+@pytest.fixture
+def learned_network(learned_weights: Path, monkeypatch: pytest.MonkeyPatch) -> Network:
+    """XFeat with these weights."""
+    from recon_cli.sfm import xfeat, xfeat_weights
+
+    monkeypatch.setenv("RECON_CACHE_DIR", str(learned_weights))
+    weights = xfeat_weights.load_weights()
+    assert weights is not None
+    return xfeat.Network(weights)
 
 
 @pytest.fixture(scope="session")

@@ -46,6 +46,7 @@ class Findings:
     disk_free_bytes: int  # where the workspace lies or would lie
     workspace: str  # its path
     writable: bool  # files can be made there
+    bridge: str  # "installed", "damaged" or "missing": the learned features for photos
     self_check: Verdict | None  # of the triton kernels on this GPU; None where they cannot run
 
 
@@ -54,6 +55,7 @@ def examine(workspace: Path) -> Findings:
     import torch
 
     from recon_cli.render import registry
+    from recon_cli.sfm import xfeat_weights
 
     cuda = torch.cuda
     root = workspace.absolute()
@@ -69,6 +71,8 @@ def examine(workspace: Path) -> Findings:
         disk_free_bytes=shutil.disk_usage(place).free,
         workspace=str(root),
         writable=place.is_dir() and os.access(place, os.W_OK | os.X_OK),
+        bridge="missing" if not xfeat_weights.are_installed() else (
+            "damaged" if xfeat_weights.load_weights() is None else "installed"),
         self_check=registry.cuda_verdict(),
     )
 
@@ -86,6 +90,9 @@ def findings_text(findings: Findings) -> str:
         outcome = f"passed in {check.seconds:.1f} s" if check.passed else (
             f"FAILED, torch is used instead: {check.failure}")
         lines.append(f"{'self-check':<13} {check.backend} on {check.device}: {outcome}")
+    advice = "" if findings.bridge == "installed" else (
+        "; `recon setup bridge` gets the learned features that match photos taken far apart")
+    lines.append(f"{'bridge':<13} {findings.bridge}{advice}")
     writable = "writable" if findings.writable else "NOT writable"
     lines += [
         f"{'cores':<13} {findings.cores}",

@@ -29,9 +29,16 @@ from recon_cli.sfm import (
     parts,
     skeleton,
     wide_lens,
+    xfeat_weights,
 )
 from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
-from recon_cli.sfm.limits import ENOUGH_FRAMES, MIN_FRAMES, MIN_ONE_POINT, MIN_PAIR_INLIERS
+from recon_cli.sfm.limits import (
+    ENOUGH_FRAMES,
+    FEW_PAIR_MATCHES,
+    MIN_FRAMES,
+    MIN_ONE_POINT,
+    MIN_PAIR_INLIERS,
+)
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.time_estimate import format_minutes
@@ -41,6 +48,9 @@ from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
 OTHERS = "others"  # in the folder of an attempt: its models that hold other frames, by number
+COARSE = "coarse"  # the fallback for photos that begins with their coarsest features
+BRIDGE = "bridge"  # the fallback with learned features, which has a database of its own
+RELAXED_BRIDGE = "bridge relaxed"  # with the database of the former, and lower thresholds
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW_PHOTOS = 30
@@ -79,6 +89,7 @@ class MapperAttempt(JsonRecord):
     reprojection_error_px: float | None = None
     # Models that fit its cameras clearly better, by number; only where another attempt may use them
     lenses: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    thin: tuple[str, ...] = ()  # frames of photos that few points place, see `list_thin`
 
     @property
     def models(self) -> list[int]:
@@ -109,7 +120,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         ways = (Fallback(TRACKS, "the frames of a video are tracked from one to the next",
                          skeleton.choose_tracked_pairs, skeleton.complete_tracked), *ways)
     elif count > FEW_PHOTOS and not job.split and not job.segments and not job.panoramas:
-        ways = (Fallback("coarse", f"the coarsest features of {count} frames show overlap",
+        ways = (Fallback(COARSE, f"the coarsest features of {count} frames show overlap",
                          skeleton.choose_coarse_pairs, skeleton.complete_coarse), *ways)
     if job.segments:
         joined = Fallback(
@@ -164,9 +175,15 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
             log.finish(fallback.name, attempt, job.attempts / fallback.name)
         attempts.append(attempt)
         if not attempt.skipped:
-            reason = attempt.shortfall
-            if not reason:
+            bridge = _with_bridge(job, attempts, ways, report)
+            if bridge is not None:
+                ways.insert(0, bridge)
+            elif fallback.name == BRIDGE and attempt.registered and attempt.shortfall:
+                ways.insert(0, Fallback(
+                    RELAXED_BRIDGE, "", lambda *_: set(), mapper.map_relaxed))
+            elif any(made.registered and not made.shortfall for made in attempts):
                 break
+            reason = attempt.shortfall or "the photos share few matches"
             if attempt.lenses:
                 ways.insert(0, _with_lenses(attempt.lenses))
             if ways and attempt.seconds > 60 * MINUTES_TOLD:
@@ -218,6 +235,54 @@ def _with_lenses(models: Mapping[str, str]) -> Fallback:
     """Returns the way to a model with other camera models, by the numbers of the cameras."""
     return Fallback(wide_lens.OTHER, "", lambda *_: set(), lambda job, report: (
         wide_lens.map_lenses(job, report, {int(number): models[number] for number in models})))
+
+
+def _with_bridge(
+    job: MappingJob, attempts: Sequence[MapperAttempt], ways: Sequence[Fallback], report: Reporter
+) -> Fallback | None:
+    """Returns the way to a model of photos with learned features, where these may help.
+
+    That is after the last attempt that matches other pairs, if the model falls short or lacks
+    frames, even such that SIFT matches to nothing, or if it is thin. Where the features are not
+    installed, the user is told how to get them.
+    """
+    last, before = attempts[-1], {attempt.name for attempt in attempts}
+    lacks = last.shortfall or len(last.registered) < ENOUGH_FRAMES * len(job.names)
+    may_help = last.thin or (lacks and not (ways and ways[0].name in _PAIRS))
+    if (not may_help or last.name not in (COARSE, *_PAIRS) or not may_bridge(job)
+            or before & {BRIDGE, "relaxed", wide_lens.ATTEMPT}):
+        return None
+    if not xfeat_weights.are_installed():
+        report.tell("These photos are few or far apart. Learned features may match them where SIFT "
+                    f"cannot: `{xfeat_weights.COMMAND}` gets them, then run `recon sfm --again`.")
+        return None
+    from recon_cli.sfm import bridge  # imports torch
+
+    best = best_attempt(attempts)
+    parts = [best.registered, *best.apart] if best else []
+    thin = best.thin if best else ()
+    return Fallback(BRIDGE, "", lambda *_: set(), lambda job, report: (
+        bridge.map_bridged(job, report, parts, thin)))
+
+
+def may_bridge(job: MappingJob) -> bool:
+    """Returns whether learned features may be asked: of photos that are mapped as one."""
+    is_segment = job.last == "model"  # has the keypoints that the others have
+    return job.pairs == "auto" and not (
+        is_segment or job.segments or job.panoramas or skeleton.is_continuous(job))
+
+
+def list_thin(model: pycolmap.Reconstruction) -> tuple[str, ...]:
+    """Returns the images that few points place which two others show; none where these are few.
+
+    Nothing else contradicts a wrong place: 13 photos were trusted that were 12 cm off in a room,
+    by images with 44 and more such points.
+    """
+    firm = {number for number, point in model.points3D.items() if point.track.length() > 2}
+    images = [model.image(number) for number in model.reg_image_ids()]
+    thin = sorted(image.name for image in images if sum(
+        point.point3D_id in firm for point in image.get_observation_points2D()) < FEW_PAIR_MATCHES)
+    return tuple(thin) if len(thin) > (1 - ENOUGH_FRAMES) * len(images) else ()
 
 
 def may_change_lenses(job: MappingJob, before: Collection[str]) -> bool:
@@ -276,12 +341,18 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
     """Returns the attempt with the best model: many frames that are strongly connected.
 
     A frame counts by the agreement across the weakest cut of its model, and at most as in a broken
-    model where another check failed; in a tie of 1% the smaller reprojection error decides, then
-    the earlier attempt.
+    model where another check failed, or where bridges were tried as it was thin; in a tie of 1%
+    the smaller reprojection error decides, then the earlier attempt. Bridges that give no trusted
+    model are worth nothing.
     """
+    bridged = any(attempt.name == BRIDGE for attempt in attempts)
+
     def quality(attempt: MapperAttempt) -> tuple[float, float]:
+        if attempt.name in (BRIDGE, RELAXED_BRIDGE) and not attempt.trusted:
+            return 0.0, 0.0
         link = attempt.weak_link if attempt.weak_link is not None else float(attempt.trusted)
-        link = link if attempt.trusted else min(link, MIN_ONE_POINT)
+        if not attempt.trusted or (bridged and attempt.thin):
+            link = min(link, MIN_ONE_POINT)
         most = max(len(other.registered) for other in attempts)
         return (round(len(attempt.registered) / most * (0.5 + 0.5 * link), 2),
                 -(attempt.reprojection_error_px or 0.0))
@@ -310,7 +381,8 @@ def _try_fallback(
         database.seal(job.database)
     job = _with_own_matches(job, fallback.name)
     candidate = merge_models.best_model(
-        job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS)
+        job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS,
+        both_ways=fallback.name in (BRIDGE, RELAXED_BRIDGE))
     seconds = round(time.monotonic() - start, 2)
     if candidate is None:
         return MapperAttempt(fallback.name, reason, seconds), None
@@ -327,7 +399,8 @@ def _try_fallback(
         candidate.apart, candidate.rejected,
         candidate.verdict.trusted, candidate.verdict.weakest_cut.share,
         candidate.model.compute_mean_reprojection_error(),
-        {str(lens.camera): lens.better for lens in found})
+        {str(lens.camera): lens.better for lens in found},
+        list_thin(candidate.model) if may_bridge(job) else ())
     return attempt, candidate
 
 
@@ -375,8 +448,8 @@ def _publish_best(
 
 def _with_own_matches(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
-    own = job.attempts / name / skeleton.MATCHES_DB
-    has_own = name in (TRACKS, wide_lens.ATTEMPT, wide_lens.OTHER) or (
+    own = job.attempts / (BRIDGE if name == RELAXED_BRIDGE else name) / skeleton.MATCHES_DB
+    has_own = name in (TRACKS, BRIDGE, RELAXED_BRIDGE, wide_lens.ATTEMPT, wide_lens.OTHER) or (
         name == SEGMENTS and job.tracks is not None)
     return dataclasses.replace(job, matches_db=own) if has_own else job
 

@@ -31,11 +31,12 @@ _DOING = {
     "coarse": ("matching coarse features", "pair"),
     "first": ("placing first cameras", "frame"),
     "mapping": ("placing cameras", "frame"),
+    "bridge": ("matching learned features", "pair"),
     "joining": ("joining segments", "segment"),
     "undistorted": ("undistorting frames", "frame")}
 # The step of a phase, where the names differ.
 _STEP = {"skeleton": "features", "coarse": "matches", "first": "matches", "mapping": "model",
-         "joining": "model"}
+         "bridge": "model", "joining": "model"}
 LOG = "log.txt"
 logger = logging.getLogger("recon")
 _LOG_TAIL = 64 * 1024  # bytes

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import click
 import cv2
@@ -36,7 +37,7 @@ from recon_cli.errors import ReconError
 from recon_cli.io.colmap_library import write_model
 from recon_cli.io.tracks import TRACKS
 from recon_cli.progress import NullProgress
-from recon_cli.sfm import fallbacks, trusted_part, worker
+from recon_cli.sfm import fallbacks, trusted_part, worker, xfeat_weights
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.verdict import examine
@@ -215,7 +216,7 @@ def keep_candidate(kept: Path) -> None:
     fallbacks.deliver_parts = deliver
 
 
-def map_photos(job: MappingJob, folder: Path) -> None:
+def map_photos(job: MappingJob, folder: Path, *, bridges: bool) -> None:
     """Maps a job and keeps what it found, and the time that it took."""
     shutil.rmtree(job.out, ignore_errors=True)
     shutil.rmtree(folder / CANDIDATE, ignore_errors=True)
@@ -223,7 +224,8 @@ def map_photos(job: MappingJob, folder: Path) -> None:
     keep_candidate(folder / CANDIDATE)
     start, refused = time.process_time(), ""
     try:
-        worker.work(dataclasses.replace(job, last="model"), quiet())
+        with mock.patch.object(xfeat_weights, "are_installed", return_value=bridges):
+            worker.work(dataclasses.replace(job, last="sparse"), quiet())
     except ReconError as error:
         refused = error.message
     (folder / RESULT).write_text(json.dumps(
@@ -250,14 +252,16 @@ def decide(
     return [part.model for part in delivered], ""
 
 
-def run(name: str, gap: int, offset: int, data: Path, out: Path) -> Row:
+def run(
+    name: str, gap: int, offset: int, data: Path, out: Path, *, bridges: bool = False
+) -> Row:
     """Maps a thinned capture, or takes what an earlier run kept, and decides."""
     capture = CAPTURES[name]
-    folder = (out / name / f"every{gap}_from{offset}").resolve()
+    folder = (out / name / f"every{gap}_from{offset}{'_bridged' * bridges}").resolve()
     photos = capture.photos(data, out / name / "frames")[offset::gap]
     job = prepare(photos, folder)
     if not (folder / RESULT).exists():
-        map_photos(job, folder)
+        map_photos(job, folder, bridges=bridges)
     result = read_json(folder / RESULT)
     models, refused = decide(job, folder / CANDIDATE) if (
         folder / CANDIDATE).exists() else ([], result["refused"])
@@ -279,30 +283,53 @@ def count(rows: Sequence[Row]) -> str:
             f"{sum(not row.judged for row in rows)} of {len(rows)}")
 
 
+def count_placed(rows: Sequence[Row]) -> str:
+    """Returns the share of the given photos that lie in trusted parts under RIGHT, by gap."""
+    shares = []
+    for gap in sorted({row.gap for row in rows}):
+        own = [row for row in rows if row.gap == gap]
+        placed = sum(len(part.names) for row in own for part in row.parts
+                     if not row.refused and part.rms < RIGHT)
+        shares.append(f"{gap}: {placed} of {sum(row.given for row in own)}")
+    return ", ".join(shares)
+
+
 @click.command(help=__doc__)
 @click.argument("data", type=FOLDER)
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
 @click.argument("names", nargs=-1)
 @click.option("--gap", "gaps", type=int, multiple=True, default=GAPS, help="Every so many photos.")
+@click.option("--bridge", "bridges", is_flag=True,
+              help="Map with learned features as well, in further columns (`recon setup bridge`).")
 @click.option("--again", is_flag=True, help="Decide on what is kept; map nothing.")
-def main(data: Path, out: Path, names: tuple[str, ...], gaps: tuple[int, ...], again: bool) -> None:
+def main(data: Path, out: Path, names: tuple[str, ...], gaps: tuple[int, ...],
+         bridges: bool, again: bool) -> None:
     """Prints the table and the counts."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     pycolmap.logging.minloglevel = 2
-    rows: list[Row] = []
-    print_head(*HEADS)
+    rows: dict[bool, list[Row]] = {False: [], True: []}
+    print_head(*HEADS, *(f"bridged: {head}" for head in HEADS[3:] if bridges))
     for name in names or CAPTURES:
         for gap in gaps:
             for place in range(OFFSETS):
                 offset = place * gap // OFFSETS
                 if again and not (out / name / f"every{gap}_from{offset}" / RESULT).exists():
                     continue
-                rows.append(run(name, gap, offset, data, out))
-                print_row(*rows[-1].cells(CAPTURES[name].metric))
-    for half in (0, 1):
-        own = [row for row in rows if CAPTURES[row.capture].half == half]
-        click.echo(f"half {half}: {count(own)}")
-    click.echo(f"all: {count(rows)}")
+                cells: list[str] = []
+                for bridged in (False, True)[:1 + bridges]:
+                    row = run(name, gap, offset, data, out, bridges=bridged)
+                    rows[bridged].append(row)
+                    cells += row.cells(CAPTURES[name].metric)[3 * bridged:]
+                print_row(*cells)
+    for bridged, found in rows.items():
+        if not found:
+            continue
+        head = "with bridges, " * bridged
+        for half in (0, 1):
+            own = [row for row in found if CAPTURES[row.capture].half == half]
+            click.echo(f"{head}half {half}: {count(own)}")
+        click.echo(f"{head}all: {count(found)}")
+        click.echo(f"{head}placed and right, by gap: {count_placed(found)}")
 
 
 if __name__ == "__main__":

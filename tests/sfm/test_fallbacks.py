@@ -244,7 +244,7 @@ def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
     stream = io.BytesIO()
     fallbacks.build_model(job, Reporter(stream), deadline=math.inf)
     told = [event for line in stream.getvalue().splitlines()
-            if isinstance(event := parse(line), str)]
+            if isinstance(event := parse(line), str) and "another mapper" in event]
     assert len(told) == 1
     assert_facts(told[0], "another mapper", "minutes more", "no model was found")
 
@@ -254,7 +254,7 @@ def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypa
     job, truth = capture
     monkeypatch.setattr(mapper, "map_incrementally", lambda *_: [
         part(truth, job.names[:10]), part(truth, job.names[10:])])
-    monkeypatch.setattr(fallbacks.merge_models, "merge", lambda *_: None)
+    monkeypatch.setattr(fallbacks.merge_models, "merge", lambda *_, **__: None)
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "")
     result = build(job)
     assert sorted(each.registered for each in result.parts) == [job.names[:10], job.names[10:]]

@@ -38,6 +38,24 @@ def test_the_similarity_between_two_parts_is_found_from_their_points(capture):
         found.matrix[:3], moved().inverse().matrix(), atol=1e-6)
 
 
+def test_a_join_counts_both_ways_only_where_three_images_of_each_agree_on_the_scale(
+    capture, monkeypatch
+):
+    job, truth = capture
+    base, other = part(truth, job.names[:12]), part(truth, job.names[12:], motion=moved())
+    scale = 1 / moved().scale
+    assert merge_models._shows_scale(job, other, base, scale)
+    assert not merge_models._shows_scale(job, other, base, 1.1 * scale)
+    assert not merge_models._shows_scale(job, part(truth, job.names[18:]), base, 1.0)
+    joined = merge_models.merge(job, base, other, both_ways=True)
+    assert mapper.list_registered(joined) == list(job.names)
+    one_way = merge_models._shows_scale
+    monkeypatch.setattr(merge_models, "_shows_scale", lambda job, source, target, scale: (
+        source is other and one_way(job, source, target, scale)))
+    assert merge_models.merge(job, base, other, both_ways=True) is None
+    assert merge_models.merge(job, base, other) is not None
+
+
 def test_a_part_that_brings_less_than_three_images_is_left_alone(capture):
     job, truth = capture
     assert merge_models.merge(
