@@ -84,7 +84,8 @@ def status_table(stages: Sequence[StageStatus]) -> str:
 
 @verb("clean")
 @click.argument(
-    "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice([row.name for row in STAGES]))
+    "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice(
+        [row.name for top in STAGES for row in (top, *top.parts)]))
 @click.option(
     "--states", is_flag=True,
     help="Also remove the states midway and at the end of a training; without them a longer one "

@@ -23,7 +23,7 @@ from recon_cli.context import StageContext, TrainCallback
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.evaluation.reference_views import mean_score
 from recon_cli.evaluation.scores import MeanScore
-from recon_cli.experiments.instruments import Clock, Host, examine
+from recon_cli.experiments.clock import Clock, Host, examine
 from recon_cli.experiments.scenes import LoadedScene, load_for_training, open_scene
 from recon_cli.experiments.variants import MidPrune, TrainingRun, Variant
 from recon_cli.pipeline.execute import render_context

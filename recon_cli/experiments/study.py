@@ -18,7 +18,7 @@ from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread, paired_t
 from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.evaluation.scores import Table, or_dash
-from recon_cli.experiments.instruments import Host
+from recon_cli.experiments.clock import Host
 from recon_cli.experiments.outputs import Result, add_legend, drawing
 from recon_cli.experiments.paper_tables import (
     CAUTION,

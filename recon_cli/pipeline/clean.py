@@ -53,7 +53,7 @@ def free_space(
     with disk_errors(workspace.root, "cleaning"), workspace.writing("clean"):
         if keep_exports:
             stages = _all_but_exports(job)
-        results = [workspace.folder(stage) for stage in stages]
+        results = [path for stage in stages for path in workspace.result_paths(stage)]
         frames = workspace.renders() if renders else []
         others = [] if stages and not keep_exports else [
             path for path in (*_spare(job, states=states), *frames)

@@ -1,4 +1,4 @@
-"""Scores, logs and sweeps of a workspace, and the tables of scores on the page.
+"""Scores and logs of a workspace, and the tables of scores on the page.
 
 The files of a stale stage may have been edited by hand, and no digest covers logs: unexpected
 content becomes a FormatError, which the page shows in its place.
@@ -15,9 +15,8 @@ from pathlib import Path
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval
-from recon_cli.evaluation.scores import Metrics, ModelMetrics, Sweep, Table, or_dash
+from recon_cli.evaluation.scores import Metrics, ModelMetrics, Table, or_dash
 from recon_cli.progress import format_megabytes
-from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.summaries import LogRow
 
 BASE, PRUNED = MODELS = ("base", "pruned")
@@ -38,12 +37,6 @@ def read_log(path: Path) -> tuple[LogRow, ...]:
     with _format_errors(path):
         path.stat()  # OSError
         return LogRow.read_all(path)
-
-
-def read_sweep(path: Path) -> Sweep:
-    """Returns the content of a sweep.json; FormatError if it is damaged."""
-    with _format_errors(path):
-        return Sweep.from_json(read_json(path, dict))
 
 
 @contextmanager

@@ -42,9 +42,8 @@ def read_room(export: StageReport) -> Room | None:
                 f"{wall['value']:.2f} ± {max(wall['error'], 0.01):.2f} m"
                 for wall in value["walls"])))
         notes = [str(note) for note in value["notes"]]
-        stale = export.summary.get("files", {}).get(PLAN, {}).get("stale")
-        if stale:
-            notes.insert(0, f"The plan is stale: {stale}.")
+        notes[:0] = [f"The plan is stale: {part.why}." for part in export.parts
+                     if part.name == f"export.{PLAN}" and not part.fresh]
         drawing = read_bytes(export.folder / PLAN)
     except (FormatError, OSError, KeyError, TypeError, ValueError) as error:
         return Room((), (f"The measures are not shown: {error}",), None)

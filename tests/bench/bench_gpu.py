@@ -25,7 +25,7 @@ import torch
 from gpu_clock import clear
 from gpu_figures import Figures
 
-from recon_cli.experiments.bench_scene import SceneSize
+from recon_cli.experiments.synthetic_room import SceneSize
 
 _SMALL = 8  # the part of Gaussians and of each side in the first checks, which are soon over
 _LEAST = 40, 16  # Gaussians, pixels

@@ -10,7 +10,7 @@ from gpu_figures import Figures
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
 
-from recon_cli.experiments.bench_scene import BenchScene, SceneSize, build_scene
+from recon_cli.experiments.synthetic_room import RoomScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.render.triton import step as triton_step
 from recon_cli.render.triton.step_status import StepReport
@@ -22,7 +22,7 @@ _FREE = 8  # steps that may not wait
 _NAMES = "picture", "means", "quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest"
 
 
-def _drawn(scene: BenchScene, backend: str, dtype: torch.dtype) -> list[Tensor]:
+def _drawn(scene: RoomScene, backend: str, dtype: torch.dtype) -> list[Tensor]:
     """Returns a picture and the gradients of its sum with the scene's weights."""
     leaves = scene.splats.map(lambda tensor: tensor.to(dtype).clone().requires_grad_())
     rgb = render(leaves, scene.camera, scene.background.to(dtype), 3, backend=backend).rgb

@@ -8,7 +8,7 @@ import importlib.util
 import torch
 from torch import Tensor
 
-from recon_cli.experiments.bench_scene import BenchScene
+from recon_cli.experiments.synthetic_room import RoomScene
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.splats import Splats
 
@@ -32,7 +32,7 @@ class Gsplat:
         leaves: means, quats, scales, opacities, harmonics.
     """
 
-    def __init__(self, scene: BenchScene) -> None:
+    def __init__(self, scene: RoomScene) -> None:
         splats: Splats = scene.splats.map(lambda tensor: tensor.detach())
         harmonics = torch.cat([splats.sh_dc[:, None], splats.sh_rest], 1)
         self.leaves = [tensor.clone().requires_grad_() for tensor in (

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.experiments.bench_scene import SceneSize, room
+from recon_cli.experiments.synthetic_room import SceneSize, room
 from recon_cli.render.triton import step as triton_step
 from recon_cli.render.triton.step_status import StepReport
 from recon_cli.scene.camera import Camera

@@ -12,7 +12,7 @@ from gpu_gsplat import Gsplat, installed
 from gpu_scene import AFTER, GATHERING, photometric, stretch, training, without_graphs
 from torch import Tensor
 
-from recon_cli.experiments.bench_scene import BenchScene, SceneSize, build_scene
+from recon_cli.experiments.synthetic_room import RoomScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.train import async_trainer
 from recon_cli.train.state import TrainState
@@ -47,7 +47,7 @@ def build(figures: Figures, size: SceneSize, steps: int) -> None:
 class _Candidate:
     """A renderer of a scene, and of its gradients by given weights."""
 
-    def __init__(self, scene: BenchScene, leaves: list[Tensor], draw: Picture) -> None:
+    def __init__(self, scene: RoomScene, leaves: list[Tensor], draw: Picture) -> None:
         self._weights, self._leaves, self._draw = scene.weights, leaves, draw
 
     @torch.no_grad()
@@ -63,7 +63,7 @@ class _Candidate:
 class _Ours(_Candidate):
     """A backend of recon."""
 
-    def __init__(self, scene: BenchScene, backend: str) -> None:
+    def __init__(self, scene: RoomScene, backend: str) -> None:
         leaves = scene.splats.map(lambda tensor: tensor.detach().clone().requires_grad_())
         super().__init__(scene, list(leaves.parameters().values()), lambda: render(
             leaves, scene.camera, scene.background, scene.sh_degree, backend=backend).rgb)

@@ -13,8 +13,8 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
-from recon_cli.experiments import instruments
-from recon_cli.experiments.instruments import Clock
+from recon_cli.experiments import clock as clocks
+from recon_cli.experiments.clock import Clock
 from recon_cli.experiments.runner import run_trial
 from recon_cli.experiments.scenes import LoadedScene, SceneFolders, check_scenes, load_for_training
 from recon_cli.experiments.variants import BUDGET, PAPER, REFERENCE, TrainingRun
@@ -34,8 +34,8 @@ def tiny(tmp_path: Path) -> LoadedScene:
 
 def test_the_clock_stands_still_in_its_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     walls, cpus = iter([1.0, 3.0, 10.0, 11.0]), iter([5.0, 9.0, 20.0, 20.5])
-    monkeypatch.setattr(instruments.time, "perf_counter", lambda: next(walls))
-    monkeypatch.setattr(instruments.time, "process_time", lambda: next(cpus))
+    monkeypatch.setattr(clocks.time, "perf_counter", lambda: next(walls))
+    monkeypatch.setattr(clocks.time, "process_time", lambda: next(cpus))
     clock = Clock("cpu")
     with clock.pause():  # from 3 to 10, and from 9 to 20
         pass
