@@ -44,6 +44,7 @@ class Style:
     quiet: bool = False
     log_format: str = "auto"
     as_object: bool = False  # stdout gets one JSON object and nothing else
+    output: CapturedOutput | None = None  # what stdout would have got instead
 
     @property
     def form(self) -> str:

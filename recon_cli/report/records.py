@@ -50,7 +50,7 @@ def _format_errors(path: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Scores:
+class ScoreTables:
     """The tables of the page."""
 
     models: Table  # side by side
@@ -61,7 +61,7 @@ class Scores:
     notes: tuple[str, ...]  # which held-out views are not scored, a sentence each
 
 
-def build_scores(metrics: Metrics) -> Scores:
+def build_scores(metrics: Metrics) -> ScoreTables:
     """Returns the tables of the scores of evaluate."""
     models = {key: metrics.models[key] for key in MODELS if key in metrics.models}
     notes = [f"{metrics.coverage[0].upper()}{metrics.coverage[1:]}."] if metrics.coverage else []
@@ -74,7 +74,7 @@ def build_scores(metrics: Metrics) -> Scores:
     notes += [f"{MODEL_LABELS[key].capitalize()}: {moving}." for key, model in models.items()
               if (moving := metrics.describe_moving(model))]
     conventions = {title: getattr(metrics, f"{key}_convention") for key, title in _TITLES.items()}
-    return Scores(
+    return ScoreTables(
         _model_table(models), _gap_table(models),
         _difference_table(metrics.pruned_minus_base) if metrics.pruned_minus_base else None,
         _view_table(models), tuple((title, text) for title, text in conventions.items() if text),
