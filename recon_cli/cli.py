@@ -17,7 +17,7 @@ import click
 
 from recon_cli import __version__, machine, signals
 from recon_cli.commands import console, hints
-from recon_cli.commands.console import CapturedOutput, Failure, Log
+from recon_cli.commands.console import Failure, Log
 from recon_cli.commands.options import Call, complete, used_variables
 from recon_cli.errors import ExitCode, ReconError, WorkspaceError
 from recon_cli.workspace import disk
@@ -55,7 +55,7 @@ VERBS = {
 # Verbs that load no library of numbers, so that they work in whatever memory there is
 _LIGHT = ("status", "clean")
 # Verbs that recon types itself
-HIDDEN = {"map-segment": "segments.map_segment", "train-block": "train_block.train_block"}
+HIDDEN = {"map-segment": "workers.map_segment", "train-block": "workers.train_block"}
 
 logger = logging.getLogger("recon")
 
@@ -135,8 +135,7 @@ def _default_workspace(verb: str) -> str | None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit code."""
-    words, stdout, begin = list(sys.argv[1:] if arguments is None else arguments), sys.stdout, (
-        time.monotonic())
+    words, begin = list(sys.argv[1:] if arguments is None else arguments), time.monotonic()
     call = Call()
 
     def complete_commands(text: str) -> str:
@@ -155,9 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             code = _exit_code(error)
             with suppress(OSError):  # of a stderr that nobody reads, or on the disk that is full
                 failure = _tell(error, log, _verb(words), complete_commands)
-        output, sys.stdout = sys.stdout, stdout
         if call.as_object or (failure and _asks_for_object(error, words)):
-            lines = output.lines if isinstance(output, CapturedOutput) else []
+            lines = call.output.lines if call.output else []
             known = call.as_object and _default_workspace(_verb(words))
             code = _print_object(console.result_object(
                 _verb(words), str(call.workspace.absolute()) if known else None, log, lines,

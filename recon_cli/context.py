@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,10 +67,10 @@ def _leave_idle() -> None:
 
 @dataclass(frozen=True)
 class EarlierResult:
-    """The finished result that a stage replaces, where it keeps files of it or continues it."""
+    """The finished result that a stage replaces, where it continues it or reads edits of it."""
 
     folder: Path
-    summary: Mapping[str, Any]  # that the stage returned then; empty where that is not known
+    summary: Mapping[str, Any]  # that the stage returned then
     changed: frozenset[str] = frozenset()  # relative paths of files that were changed by hand
     missing: frozenset[str] = frozenset()  # of those that were removed
     foreign: frozenset[str] = frozenset()  # of those that the stage did not write
@@ -85,8 +85,8 @@ class StageInputs:
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
     continues: Path | None = None  # finished result of the stage itself that the run continues
     digests: Mapping[str, str] = field(default_factory=dict)  # of the files in each of `folders`
-    earlier: EarlierResult | None = None  # that the stage adds to or continues, if any
-    again: bool = False  # files that are up to date are written again as well
+    earlier: EarlierResult | None = None  # that the stage continues, if any
+    part: str = ""  # of the stage that is made; empty for its own result
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,8 @@ class StageContext:
     scratch: Path | None = None  # folder for files without a name; None: the system's
     compute: ComputeConfig | None = None  # as typed, for work on other machines; None: as here
     deadline: Deadline = field(default_factory=Deadline)  # for what the stage may do without
+
+    shared: dict[Hashable, Any] = field(default_factory=dict)  # by one run with its parts
 
     name_photos: Callable[[str], str] = str  # calls them in a text by the names of their files
 

@@ -59,9 +59,9 @@ if TYPE_CHECKING:
     from recon_cli.progress import Progress as Progress
     from recon_cli.progress import TqdmProgress as TqdmProgress
     from recon_cli.scene.camera import Camera as Camera
-    from recon_cli.workspace.export_record import ExportSummary as ExportSummary
     from recon_cli.workspace.summaries import DenoiseSummary as DenoiseSummary
     from recon_cli.workspace.summaries import EvaluateSummary as EvaluateSummary
+    from recon_cli.workspace.summaries import ExportSummary as ExportSummary
     from recon_cli.workspace.summaries import ImportSummary as ImportSummary
     from recon_cli.workspace.summaries import IngestSummary as IngestSummary
     from recon_cli.workspace.summaries import PruneSummary as PruneSummary
@@ -83,8 +83,7 @@ _PUBLIC: dict[str, tuple[str, ...]] = {
         "EvaluateResult", "ExportResult", "View"),
     "recon_cli.workspace.summaries": (
         "IngestSummary", "DenoiseSummary", "SfmSummary", "TrainSummary", "ImportSummary",
-        "PruneSummary", "EvaluateSummary"),
-    "recon_cli.workspace.export_record": ("ExportSummary",),
+        "PruneSummary", "EvaluateSummary", "ExportSummary"),
     "recon_cli.pipeline.plan": ("StageStatus",),
     "recon_cli.config.stages": (
         "IngestConfig", "DenoiseConfig", "SfmConfig", "TrainConfig", "PruneConfig",

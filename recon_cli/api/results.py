@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
-from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.json_record import JsonRecord
 from recon_cli.workspace.records import FOLDER, read_frame_list
 from recon_cli.workspace.summaries import (
     EvaluateSummary,
+    ExportSummary,
     IngestSummary,
     LogRow,
     SfmSummary,
@@ -153,16 +153,14 @@ class EvaluateResult(StageResult[EvaluateSummary]):
 class ExportResult(StageResult[ExportSummary]):
     """The exported files."""
 
+    # files, or folders of files, of the other formats that fit the .ply, by name
+    files: Mapping[str, Path] = field(default_factory=dict)
+
     @property
     def ply(self) -> Path:
         """The .ply."""
         return self.folder / self.summary.file
 
-    @property
-    def files(self) -> Mapping[str, Path]:
-        """The files, or folders of files, of the other formats that fit the .ply, by name."""
-        return {name: self.folder / record.file
-                for name, record in (self.summary.files or {}).items() if not record.stale}
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ run again, an interrupted one is resumed, and both may take turns on one workspa
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -156,7 +157,11 @@ class Workspace:
         self, *, config: ExportConfig | None = None, again: bool = False, **options: Any
     ) -> ExportResult:
         """Writes a .ply and the formats of `format`, with commas between, and verifies each."""
-        return self._run(ExportResult, _row("export"), config, options, again=again)
+        result = self._run(ExportResult, _row("export"), config, options, again=again)
+        return dataclasses.replace(result, files={
+            check.row.part: result.folder / check.manifest.run.summary["file"]
+            for check in plan.check_parts(self._job(), "export")
+            if check.manifest and check.fresh})
 
     def report(self, out: str | Path | None = None) -> Path:
         """Writes an HTML report and returns its path; by default report.html in the workspace."""
@@ -229,12 +234,15 @@ class Workspace:
             row.verb, (row.name,), paths, options=make_options(config, options, section),
             again=again, from_import=from_import, callbacks=tuple(callbacks), table=table)
         with _collecting_notices() as notices, _keeping_threads(row):
-            outcome = self._open.run(request)[-1]
+            outcomes = self._open.run(request)
+        outcome = next(one for one in reversed(outcomes) if one.stage == row.name)
         run = outcome.manifest.run
         earlier = () if outcome.ran else run.summary.get("notices") or ()
         return kind(
-            stage=row.name, folder=self.path / row.name, ran=outcome.ran, seconds=run.seconds,
-            summary=row.summary.from_json(run.summary), notices=(*notices, *earlier))
+            stage=row.name, folder=self.path / row.name,
+            ran=any(one.ran for one in outcomes if one.stage.partition(".")[0] == row.name),
+            seconds=run.seconds, summary=row.summary.from_json(run.summary),
+            notices=(*notices, *earlier))
 
 
 def _row(name: str) -> Stage:

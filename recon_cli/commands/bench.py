@@ -111,7 +111,7 @@ def bench(call: Call, /, **typed: Any) -> None:
     float64, for every backend.
     """
     compute = settings.build(ComputeConfig, call.settings)
-    from recon_cli.experiments.rasterizer_benchmark import BenchRequest, run
+    from recon_cli.experiments.backends import BenchRequest, run
 
     click.echo(run(
         BenchRequest(**typed, device=compute.device, threads=compute.threads),

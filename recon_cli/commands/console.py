@@ -44,6 +44,7 @@ class Style:
     quiet: bool = False
     log_format: str = "auto"
     as_object: bool = False  # stdout gets one JSON object and nothing else
+    output: CapturedOutput | None = None  # what stdout would have got instead
 
     @property
     def form(self) -> str:
@@ -194,7 +195,7 @@ def result_object(
     stages = [{"name": outcome.stage, "ran": outcome.ran,
                "seconds": outcome.manifest.run.seconds, "summary": outcome.manifest.run.summary}
               for outcome in log.outcomes]
-    files = [f"{outcome.stage}/{name}" for outcome in log.outcomes if outcome.ran
+    files = [f"{outcome.stage.partition('.')[0]}/{name}" for outcome in log.outcomes if outcome.ran
              for name in outcome.manifest.outputs]
     return json.dumps({**fields, "stages": stages, "files": files, "notices": log.notices,
                        "output": output}, indent=1)

@@ -11,10 +11,10 @@ import click
 
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call
+from recon_cli.pipeline.plan import check_parts
 from recon_cli.progress import format_megabytes
-from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.records import name_photos, read_frame_list
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import ExportSummary, SfmSummary
 
 
 def end_run(call: Call, *, open_page: bool = False) -> None:
@@ -29,8 +29,9 @@ def end_run(call: Call, *, open_page: bool = False) -> None:
     export = ExportSummary.from_json(manifest.run.summary)
     write_report(job, None)
     report = job.workspace.root / FILE
-    html = (export.files or {}).get("html")
-    page = folder / html.file if html is not None and not html.stale else None
+    page = next((folder / check.manifest.run.summary["file"]
+                 for check in check_parts(job, "export")
+                 if check.row.part == "html" and check.manifest and check.fresh), None)
     click.echo("")
     for name, path in (("scene", folder / export.file), ("page", page), ("report", report)):
         if path is not None:

@@ -11,7 +11,7 @@ import click
 
 from recon_cli.api.runs import OpenWorkspace, RunRequest
 from recon_cli.commands.options import Call
-from recon_cli.commands.sentences import describe_summary, fresh_files
+from recon_cli.commands.sentences import describe_summary
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig
@@ -20,7 +20,6 @@ from recon_cli.jobs.executor import NEEDS_GPU, Executor, start_executor
 from recon_cli.pipeline.execute import Job, Outcome
 from recon_cli.progress import TqdmProgress, format_duration
 from recon_cli.stages import STAGES, Stage
-from recon_cli.workspace.export_record import ExportSummary
 
 logger = logging.getLogger("recon")
 
@@ -74,10 +73,7 @@ def report_outcome(outcome: Outcome) -> None:
             "%s (%s)", ": ".join(filter(None, [outcome.stage, sentence])),
             format_duration(run.seconds), extra=_of(outcome))
         return
-    files = (fresh_files(ExportSummary.from_json(run.summary))
-             if outcome.stage == "export" and run.summary.get("files") else [])
-    logger.info("%s", ": ".join(
-        filter(None, [f"{outcome.stage} is up to date", ", ".join(files)])), extra=_of(outcome))
+    logger.info("%s is up to date", outcome.stage, extra=_of(outcome))
     for notice in run.summary.get("notices") or ():
         logger.warning("%s", notice)
 

@@ -6,10 +6,10 @@ declared once, in config/stages.py, and only typed options reach the settings.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import os
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -191,8 +191,9 @@ print_config = _switch("--print-config", "Print options as TOML and exit.", expe
 
 def _begin_object(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
     if value and not ctx.resilient_parsing:
-        ctx.ensure_object(Call).as_object = True
-        sys.stdout = CapturedOutput()  # `cli.main` puts the other one back
+        call = ctx.ensure_object(Call)
+        call.as_object, call.output = True, CapturedOutput()
+        ctx.find_root().with_resource(contextlib.redirect_stdout(call.output))
 
 
 def _style_options(*, has_json: bool, expert: bool) -> list[Option]:

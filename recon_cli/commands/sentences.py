@@ -9,11 +9,13 @@ from typing import Any
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ManifestError, format_count
 from recon_cli.progress import format_megabytes
-from recon_cli.stages import IMPORT, STAGES
-from recon_cli.workspace.export_record import ExportSummary
+from recon_cli.stages import IMPORT
+from recon_cli.stages import stage as stage_row
 from recon_cli.workspace.summaries import (
     DenoiseSummary,
     EvaluateSummary,
+    ExportedFile,
+    ExportSummary,
     ImportSummary,
     IngestSummary,
     JsonRecord,
@@ -25,10 +27,9 @@ from recon_cli.workspace.summaries import (
 
 def describe_summary(stage: str, summary: Mapping[str, Any]) -> str:
     """Returns a sentence about a stage's summary; empty where another version of recon wrote it."""
-    rows = (IMPORT, *STAGES) if "sha256" in summary else STAGES
-    kind = next(row.summary for row in rows if row.name == stage)
+    imported = stage == IMPORT.name and "sha256" in summary
     try:
-        return describe(kind.from_json(summary))
+        return describe((IMPORT if imported else stage_row(stage)).summary.from_json(summary))
     except ManifestError:  # the stage is stale then, and its reason is shown
         return ""
 
@@ -114,20 +115,18 @@ def _(scores: EvaluateSummary) -> str:
 @describe.register
 def _(export: ExportSummary) -> str:
     model = MODEL_LABELS.get(export.model, export.model)
-    others = [one for one in (export.files or {}).values() if not one.stale]
-    return _join([
-        f"{export.file} ({model} model, {export.gaussians:,} Gaussians, "
-        f"{format_megabytes(export.bytes)})",
-        "also " + ", ".join(
-            one.file + (f" ({format_megabytes(one.bytes)})" if one.bytes is not None else "")
-            for one in others) if others else "",
-        f"NOT written: {', '.join(export.failed)}" if export.failed else ""])
+    return (f"{export.file} ({model} model, {export.gaussians:,} Gaussians, "
+            f"{format_megabytes(export.bytes)})")
 
 
-def fresh_files(export: ExportSummary) -> list[str]:
-    """Returns the names of an export's files that are up to date."""
-    others = (export.files or {}).values()
-    return [export.file, *(one.file for one in others if not one.stale)]
+@describe.register
+def _(exported: ExportedFile) -> str:
+    facts = [
+        "" if exported.bytes is None else format_megabytes(exported.bytes),
+        "" if exported.smaller is None else f"{exported.smaller:.1f}x smaller",
+        "" if exported.psnr_change_db is None else f"{exported.psnr_change_db:+.2f} dB"]
+    text = ", ".join(filter(None, facts))
+    return f"{exported.file} ({text})" if text else exported.file
 
 
 def _validation(psnr_db: float | None) -> str:

@@ -110,47 +110,19 @@ def import_scene(call: Call, file: Path | None) -> None:
                    f"{name_workspace('recon export --format html', call.workspace)}")
 
 
-def _parse_ratios(_ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[float, ...]:
-    try:
-        ratios = tuple(sorted({float(word) for word in text.split(",")}))
-    except ValueError:
-        ratios = ()
-    if not ratios or not 0 < ratios[0] <= ratios[-1] < 1:
-        raise click.BadParameter(
-            f"{text!r} is not a list of fractions between 0 and 1, such as 0.5,0.8.",
-            param=parameter)
-    return ratios
-
-
 @verb("prune")
-@click.option(
-    "--sweep", is_flag=True,
-    help="Print the loss on the validation views for every score at every ratio, with controls, "
-         "write sweep.json and sweep.svg into the workspace, and exit.  [default: off]")
-@click.option(
-    "--ratios", default="0.5,0.66,0.8,0.9", metavar="X,X,...", callback=_parse_ratios,
-    show_default=True, help="With --sweep: fractions to remove.")
 @options.stage(PruneConfig, renders=True)
 @pass_call
-def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
+def prune(call: Call) -> None:
     """Remove the least important Gaussians and fine-tune the rest."""
-    if sweep:
-        from recon_cli.experiments.sweep import run_sweep
-
-        click.echo(run_sweep(*open_job_with(call, PruneConfig), ratios).text())
-        return
     run_stages(call, "prune", ["prune"])
 
 
 @verb("eval")
 @click.argument("items", metavar="[ITEM]...", nargs=-1, type=options.PathType())
 @click.option(
-    "--seeds", type=click.IntRange(min=1), metavar="N",
-    help="Train the models N - 1 more times with other seeds; print mean and deviation.  "
-         "[default: off]")
-@click.option(
     "--form", type=click.Choice(FORMS), default="text",
-    help="With ITEM or --seeds: format of the table.  [default: text]")
+    help="With ITEM: format of the table.  [default: text]")
 @click.option(
     "--caption", default="", metavar="TEX",
     help="With ITEM and --form latex: caption of the table.  [default: none]")
@@ -162,8 +134,7 @@ def prune(call: Call, sweep: bool, ratios: tuple[float, ...]) -> None:
 @options.stage(EvaluateConfig, renders=True)
 @pass_call
 def evaluate(
-    call: Call, items: tuple[Path, ...], seeds: int | None, form: str, caption: str, label: str,
-    explain: bool,
+    call: Call, items: tuple[Path, ...], form: str, caption: str, label: str, explain: bool,
 ) -> None:
     """Score every model on the held-out views.
 
@@ -172,15 +143,9 @@ def evaluate(
     """
     if (caption or label) and (form != "latex" or not items):
         raise click.UsageError("--caption and --label need ITEM and --form latex.")
-    if items and seeds:
-        raise click.UsageError("--seeds is about one workspace: give it with -w, without ITEM.")
     if explain and form != "text":
         raise click.UsageError("--explain stands below a table of --form text.")
-    if seeds:
-        from recon_cli.experiments.seeds import score_seeds
-
-        click.echo(score_seeds(*open_job_with(call, EvaluateConfig), seeds).text(form))
-    elif items:
+    if items:
         from recon_cli.commands.compare_scores import compare
 
         click.echo(compare(

@@ -15,7 +15,7 @@ from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.sentences import describe_summary
 from recon_cli.pipeline import plan
-from recon_cli.pipeline.clean import Removal, find_states, free_space
+from recon_cli.pipeline.clean import CleanItem, find_states, free_space
 from recon_cli.pipeline.plan import Job, StageStatus
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.stages import STAGES
@@ -84,7 +84,8 @@ def status_table(stages: Sequence[StageStatus]) -> str:
 
 @verb("clean")
 @click.argument(
-    "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice([row.name for row in STAGES]))
+    "stages", metavar="[STAGE]...", nargs=-1, type=click.Choice(
+        [row.name for top in STAGES for row in (top, *top.parts)]))
 @click.option(
     "--states", is_flag=True,
     help="Also remove the states midway and at the end of a training; without them a longer one "
@@ -130,7 +131,7 @@ def _offer(option: str, paths: Sequence[Path], workspace: Workspace) -> None:
                     ", ".join(str(path.relative_to(workspace.root)) for path in paths))
 
 
-def _list_removals(job: Job, removals: Sequence[Removal]) -> None:
+def _list_removals(job: Job, removals: Sequence[CleanItem]) -> None:
     """Prints what is removed, by stage, with sizes."""
     for stage in dict.fromkeys(item.stage for item in removals):
         own = [item for item in removals if item.stage == stage]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from recon_cli.config.fields import StageConfig, option
 from recon_cli.config.stages import SCALE_BETWEEN, check_scale_between
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, ReconError, ReconstructionError
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, OTHER_NAMES, describe_max_loss
 
@@ -71,36 +72,36 @@ class ExportConfig(StageConfig):
     format: str = option(
         "ply", "Formats besides the .ply, with commas between or repeated: "
         f"{', '.join(EXPORT_FORMATS)}.", metavar="NAME,...", repeatable=True,
-        per_file=True)
+        late=True)
     max_loss: float | None = option(
         None, "Maximum loss of validation PSNR by a format.", unit="dB", minimum=0.0,
-        per_file=True, automatic=describe_max_loss())
+        automatic=describe_max_loss())
     skip_lossy: bool = option(
         False, "Leave out a format that loses more than --max-loss, with a notice, instead of "
-        "failing.", per_file=True, expert=True)
+        "failing.", hashed=False, expert=True)
     title: str | None = option(
-        None, "Title of the page (html).", metavar="TEXT", per_file=True,
+        None, "Title of the page (html).", metavar="TEXT",
         automatic="from the name of the capture")
-    credits: bool = option(False, "Say on the page (html) what made it.", per_file=True)
+    credits: bool = option(False, "Say on the page (html) what made it.")
     max_triangles: int = option(
-        300_000, "Maximum number of triangles of a mesh.", minimum=4, per_file=True)
+        300_000, "Maximum number of triangles of a mesh.", minimum=4)
     voxel: float | None = option(
         None, "Side of the voxels that a mesh is made in, in units of the exported scene.",
-        minimum=0.0, per_file=True, expert=True,
+        minimum=0.0, expert=True,
         automatic="1/128 of the median depth; 2 cm in a room")
     inferred: str = option(
         "on", "Holes in walls, floor and ceiling that surface of the same plane surrounds: close "
         "and mark them (on), also in blue (tint), or leave them open (off).",
-        choices=("on", "off", "tint"), per_file=True)
+        choices=("on", "off", "tint"))
     texture: int = option(
         4096, "Side of the texture of a mesh (.glb, .obj) in texels; 0: a colour for each vertex.",
-        minimum=0, maximum=16384, per_file=True)
+        minimum=0, maximum=16384)
     texture_format: str = option(
-        "png", "Format of the texture.", choices=("png", "jpg"), per_file=True, expert=True)
+        "png", "Format of the texture.", choices=("png", "jpg"), expert=True)
     spz_version: int = option(
         3, "Version of .spz: 3 is read by most programs; 2 by older ones, with coarser "
         "rotations; 4 by PlayCanvas' engine, but not by Spark.", minimum=2, maximum=4,
-        per_file=True, expert=True)
+        expert=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,3 +124,20 @@ class ExportConfig(StageConfig):
         """The names in `format`, each once."""
         names = (name.strip() for name in self.format.split(","))
         return tuple(dict.fromkeys(OTHER_NAMES.get(name, name) for name in names))
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The formats besides the .ply."""
+        return tuple(name for name in self.formats if name != "ply")
+
+    def excuses(self, error: ReconError) -> bool:
+        """Returns whether a format may be left out for this error: as it loses too much."""
+        return self.skip_lossy and isinstance(error, ReconstructionError)
+
+    def hashed_fields(self) -> dict[str, Any]:
+        """Returns the fields that affect a result; of the formats, the one that max_mb limits."""
+        values = super().hashed_fields()
+        values.pop("format", None)
+        if self.max_mb is not None and self.formats[0] != "ply":
+            values["format"] = self.formats[0]
+        return values

@@ -14,7 +14,7 @@ from functools import cache
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, ReconError
 
 _SHOWN = 100  # characters of a value
 MOST = 2**31 - 1  # of any integer: the limit of COLMAP and others
@@ -30,8 +30,6 @@ class OptionInfo:
     minimum: float | None = None
     maximum: float | None = None
     hashed: bool = True  # the field affects the result, and so the fingerprint of its stage
-    # it decides on some files of its stage alone: their records are compared, not the fingerprint
-    per_file: bool = False
     # it came later: at its default it is left out of the fingerprint, so that older results stay
     # fresh
     late: bool = False
@@ -131,11 +129,14 @@ class StageConfig:
             f"{name} is {repr(value)[:_SHOWN]}, but it must be {needed}.",
             hint=f"Change --{name.replace('_', '-')} or {name} in recon.toml.")
 
-    @classmethod
-    def per_file_fields(cls) -> tuple[str, ...]:
-        """Returns the fields that decide on some files of the stage alone."""
-        return tuple(
-            item.name for item in dataclasses.fields(cls) if option_info(item).per_file)
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts of the stage that are asked for besides its own result."""
+        return ()
+
+    def excuses(self, error: ReconError) -> bool:  # noqa: ARG002
+        """Returns whether a part may be left out for this error."""
+        return False
 
     @classmethod
     def late_fields(cls) -> tuple[str, ...]:

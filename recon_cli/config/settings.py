@@ -46,10 +46,15 @@ GONE: dict[str, dict[str, tuple[Any, ...]]] = {
     "train": {"poses": ("auto", "off"), "densify_scale": (0.01,), "tone": ("off",),
               "blur": ("auto", "off"), "shutter": ()},
     "merge": {"validation": (0.05,)},
+    "prune": {"sweep": (), "ratios": ()},
+    "evaluate": {"seeds": ()},
     "export": {"drop_backdrop": (False,)},
 }
 
-SUCCESSORS = {("export", "drop_backdrop"): "Give --backdrop drop, in a file backdrop = 'drop'."}
+SUCCESSORS = {
+    ("export", "drop_backdrop"): "Give --backdrop drop, in a file backdrop = 'drop'.",
+    ("prune", "sweep"): "Run `recon prune --again --score NAME --ratio X` for each.",
+    ("evaluate", "seeds"): "`recon study --scenes WORKSPACE --seeds N` trains with N seeds."}
 FILE = "recon.toml"  # in the workspace
 Settings = dict[str, dict[str, Any]]  # section -> field -> value, explicit ones only
 C = TypeVar("C", bound=StageConfig)

@@ -1,6 +1,7 @@
 """The layouts of data sets with poses, recognised by their files and folders.
 
-docs/captures.md lists every row; a test compares them.
+docs/captures.md lists every row; a test compares them. Another package adds a row by the entry
+point `recon.layouts`; it is asked last.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from recon_cli.datasets.split_lists import apply_lists
 from recon_cli.datasets.stray_scanner import is_stray, read_stray
 from recon_cli.datasets.transforms import is_transforms, read_transforms
 from recon_cli.errors import FormatError, InputError, format_count, list_names
+from recon_cli.plugins import load_rows
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ LAYOUTS: tuple[Layout, ...] = (
            "cameras.json and odm_report/shots.geojson", is_opensfm, read_opensfm),
     Layout("llff", "an LLFF scene", "poses_bounds.npy and images/", is_llff, read_llff),
 )
+LAYOUTS += tuple(load_rows("recon.layouts", Layout, [row.name for row in LAYOUTS]))
 PACKED = "record3d"  # the layout of what `packed` unpacks
 
 

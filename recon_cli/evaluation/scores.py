@@ -167,37 +167,6 @@ class Metrics(JsonRecord):
 
 
 @dataclass(frozen=True)
-class SweepTrial(JsonRecord):
-    """One way to prune a model, and the result."""
-
-    score: str  # its name; Sweep.CONTROL for the controls
-    # Fraction removed; of a control with equal seconds that of its trial, None with equal steps.
-    ratio: float | None
-    gaussians: int  # that are left
-    steps: int  # of recovery
-    seconds: float  # of recovery and scoring
-    removed: MeanScore | None  # right after the last removal; None where nothing was removed
-    recovered: MeanScore  # at the end
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sweep(JsonRecord):
-    """The content of sweep.json, which `recon prune --sweep` writes."""
-
-    FILE: ClassVar[str] = "sweep.json"
-    CONTROL: ClassVar[str] = "none"  # the score of trials that remove nothing
-
-    of_train: str | None = None  # digest of the training; None in files of older versions
-    validation_views: int
-    at: str
-    rounds: int
-    recovery_steps: int
-    equal_seconds_of: str  # the score whose seconds the controls take
-    before: MeanScore
-    trials: tuple[SweepTrial, ...]
-
-
-@dataclass(frozen=True)
 class Table:
     """Rows of cells, each as long as the headings; the first column holds names, others numbers."""
 

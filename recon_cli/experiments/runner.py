@@ -23,8 +23,8 @@ from recon_cli.context import StageContext, TrainCallback
 from recon_cli.errors import ConfigError, FormatError
 from recon_cli.evaluation.reference_views import mean_score
 from recon_cli.evaluation.scores import MeanScore
-from recon_cli.experiments.instruments import Clock, Host, examine
-from recon_cli.experiments.scenes import LoadedScene, load_for_training, open_scene
+from recon_cli.experiments.clock import Clock, Host, examine
+from recon_cli.experiments.scenes import ExperimentScene, load_for_training, open_scene
 from recon_cli.experiments.variants import MidPrune, TrainingRun, Variant
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import Progress
@@ -81,7 +81,7 @@ class ExperimentRequest:
 
     def load(
         self, paths: Mapping[str, Path], scratch: Path, split: str, progress: Progress
-    ) -> tuple[Host, Iterator[LoadedScene]]:
+    ) -> tuple[Host, Iterator[ExperimentScene]]:
         """Returns this machine and the scenes, each loaded when it is asked for.
 
         Data sets become workspaces in `scratch`.
@@ -165,7 +165,7 @@ class SceneRuns:
     runs: Mapping[str, Runs]  # by comparison
 
     @staticmethod
-    def from_loaded(loaded: LoadedScene, runs: Mapping[str, Runs]) -> SceneRuns:
+    def from_loaded(loaded: ExperimentScene, runs: Mapping[str, Runs]) -> SceneRuns:
         """Returns the runs on a scene."""
         camera = loaded.scored[0].camera
         return SceneRuns(len(loaded.scored), camera.width, camera.height, runs)
@@ -175,7 +175,7 @@ class SceneRuns:
         return {"views": self.views, "width": self.width, "height": self.height}
 
 
-def key_of(loaded: LoadedScene, run: TrainingRun) -> str:
+def key_of(loaded: ExperimentScene, run: TrainingRun) -> str:
     """Returns the key of a run: all that affects its result. Threads affect only seconds."""
     versions = [__version__, *(stage(name).version for name in ("train", "prune", "evaluate"))]
     return sha256_json({
@@ -260,7 +260,7 @@ class Runner:
         self._machine, self._records = machine, records
 
     def pilot_seconds(
-        self, loaded: LoadedScene, variants: Sequence[Variant], *, most: int = PILOT_STEPS
+        self, loaded: ExperimentScene, variants: Sequence[Variant], *, most: int = PILOT_STEPS
     ) -> dict[str, float]:
         """Returns the approximate seconds of a step by variant; the pilots also warm caches.
 
@@ -276,7 +276,7 @@ class Runner:
         return seconds
 
     def run_all(
-        self, loaded: LoadedScene, variants: Sequence[Variant], seeds: int,
+        self, loaded: ExperimentScene, variants: Sequence[Variant], seeds: int,
         steps: Mapping[str, int], *, label: str,
         score_at: Callable[[int], Sequence[int]] = lambda _steps: (),
     ) -> Runs:
@@ -297,12 +297,12 @@ class Runner:
 
             return run_grid({variant.name: variant for variant in variants}, range(seeds), measure)
 
-    def find_record(self, loaded: LoadedScene, run: TrainingRun) -> Record | None:
+    def find_record(self, loaded: ExperimentScene, run: TrainingRun) -> Record | None:
         """Returns an earlier run, None where there is none or nothing is recorded."""
         return self._records.run(key_of(loaded, run)) if self._records else None
 
     def make(
-        self, loaded: LoadedScene, run: TrainingRun, score_at: Sequence[int],
+        self, loaded: ExperimentScene, run: TrainingRun, score_at: Sequence[int],
         on_step: Callable[[], None],
     ) -> Record:
         """Makes and records a run."""
@@ -345,7 +345,8 @@ class _StepCallback(TrainCallback):
 
 
 def run_trial(
-    loaded: LoadedScene, run: TrainingRun, score_at: Sequence[int], *, on_step: Callable[[], None]
+    loaded: ExperimentScene, run: TrainingRun, score_at: Sequence[int], *,
+    on_step: Callable[[], None],
 ) -> tuple[CurvePoint, ...]:
     """Trains and returns the scores after the steps in `score_at`, 0 for the start, and at the end.
 
@@ -403,7 +404,7 @@ def _prune_run(
         score=config.score, beta=config.beta, callbacks=callbacks)
 
 
-def run_pilot(loaded: LoadedScene, variant: Variant, steps: int = PILOT_STEPS) -> CurvePoint:
+def run_pilot(loaded: ExperimentScene, variant: Variant, steps: int = PILOT_STEPS) -> CurvePoint:
     """Returns the end of a short run of the whole recipe, after a few steps that warm caches."""
     for iterations in (_WARM_STEPS, steps):
         points = run_trial(

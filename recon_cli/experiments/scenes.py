@@ -106,7 +106,7 @@ def open_scene(
 
 
 @dataclass(frozen=True, eq=False)
-class LoadedScene:
+class ExperimentScene:
     """A scene in memory, ready to be trained on by any variant."""
 
     folders: SceneFolders
@@ -148,7 +148,7 @@ class LoadedScene:
 
 def load_for_training(
     folders: SceneFolders, split: str, base: RunConfig, ctx: StageContext
-) -> LoadedScene:
+) -> ExperimentScene:
     """Returns a scene with the views to score in memory, those of `split`: test or validation.
 
     Raises:
@@ -168,4 +168,4 @@ def load_for_training(
         scene.test if split == "test" else scene.validation, base.max_size, ctx)
     if not views:
         raise ConfigError(f"The masks of {folders.name} leave no view to score.", hint=MASK_HINT)
-    return LoadedScene(folders, scene, views, base, ctx)
+    return ExperimentScene(folders, scene, views, base, ctx)

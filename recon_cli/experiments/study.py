@@ -18,7 +18,7 @@ from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread, paired_t
 from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.evaluation.scores import Table, or_dash
-from recon_cli.experiments.instruments import Host
+from recon_cli.experiments.clock import Host
 from recon_cli.experiments.outputs import Result, add_legend, drawing
 from recon_cli.experiments.paper_tables import (
     CAUTION,
@@ -39,7 +39,7 @@ from recon_cli.experiments.runner import (
     key_of,
     shared_options,
 )
-from recon_cli.experiments.scenes import LoadedScene, check_scenes
+from recon_cli.experiments.scenes import ExperimentScene, check_scenes
 from recon_cli.experiments.variants import (
     BUDGET,
     BUDGET_PRUNED,
@@ -232,7 +232,7 @@ class Study:
         self._runner = Runner(request.base, progress, machine, records)
         self._variants = request.design.variants
 
-    def load(self, loading: Iterable[LoadedScene], count: int) -> list[LoadedScene]:
+    def load(self, loading: Iterable[ExperimentScene], count: int) -> list[ExperimentScene]:
         """Returns all of `count` scenes, and says how many runs are missing.
 
         To make cameras for a scene takes minutes, so how long all will take is said as soon as the
@@ -241,7 +241,7 @@ class Study:
         each = len(self._request.design.comparisons) * len(self._variants) * self._request.seeds
         logger.warning("at most %d runs of about %s steps; their time is estimated on the first "
                        "scene", count * each, f"{self._request.iterations:,}")
-        scenes, missing, start = list[LoadedScene](), 0, time.monotonic()
+        scenes, missing, start = list[ExperimentScene](), 0, time.monotonic()
         for loaded in loading:
             scenes.append(loaded)
             counts = {variant.name: self._count_missing(loaded, variant)
@@ -261,7 +261,7 @@ class Study:
             logger.warning("all %d runs are kept from before", recorded)
         return scenes
 
-    def _estimate_seconds(self, loaded: LoadedScene, counts: Mapping[str, int]) -> float:
+    def _estimate_seconds(self, loaded: ExperimentScene, counts: Mapping[str, int]) -> float:
         """Returns how long so many runs of each variant take on a scene."""
         seeds, iterations = self._request.seeds, self._request.iterations
         steps = self._runner.pilot_seconds(loaded, self._variants, most=iterations)
@@ -271,7 +271,7 @@ class Study:
             steps[name] * min(count, seeds) + slowest * max(0, count - seeds)
             for name, count in counts.items())
 
-    def _count_missing(self, loaded: LoadedScene, variant: Variant) -> int:
+    def _count_missing(self, loaded: ExperimentScene, variant: Variant) -> int:
         """Returns how many runs of a variant are missing; those of unknown steps are, too."""
         steps: list[Mapping[str, int] | None] = [{variant.name: self._request.iterations}]
         if EQUAL_SECONDS in self._request.design.comparisons:
@@ -282,7 +282,7 @@ class Study:
                 variant, self._request.base, by_variant[variant.name], seed)) is None
             for by_variant in steps for seed in range(self._request.seeds))
 
-    def run_scene(self, loaded: LoadedScene) -> SceneRuns:
+    def run_scene(self, loaded: ExperimentScene) -> SceneRuns:
         """Returns all runs on a scene; the missing ones are made now."""
         steps = dict.fromkeys(
             (variant.name for variant in self._variants), self._request.iterations)
@@ -293,12 +293,12 @@ class Study:
         loaded.release()
         return SceneRuns.from_loaded(loaded, runs)
 
-    def _run_all(self, loaded: LoadedScene, comparison: str, steps: Mapping[str, int]) -> Runs:
+    def _run_all(self, loaded: ExperimentScene, comparison: str, steps: Mapping[str, int]) -> Runs:
         return self._runner.run_all(
             loaded, self._variants, self._request.seeds, steps,
             label=f"{loaded.folders.name}, {comparison}")
 
-    def _steps(self, loaded: LoadedScene, equal: Runs) -> Mapping[str, int]:
+    def _steps(self, loaded: ExperimentScene, equal: Runs) -> Mapping[str, int]:
         """Returns the steps at equal seconds: fixed ones, or a guess corrected by one run each."""
         key, count = self._steps_key(loaded), self._request.iterations
         if (fixed := self._records.find(key)) is not None:
@@ -321,7 +321,7 @@ class Study:
         clock = "cpu_seconds" if self._request.clock == "cpu" else "seconds"
         return FIGURES[clock].value(record.last)
 
-    def _steps_key(self, loaded: LoadedScene) -> str:
+    def _steps_key(self, loaded: ExperimentScene) -> str:
         """Returns the key of the steps at equal seconds, whatever the number of seeds."""
         request = self._request
         first = [key_of(loaded, TrainingRun(variant, request.base, request.iterations, 0))

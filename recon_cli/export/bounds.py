@@ -22,7 +22,7 @@ from recon_cli.export.synthetic_cameras import ASSUMED_DB, SelfPsnr
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.workspace.export_record import ExportChange
+from recon_cli.workspace.summaries import ExportChange
 
 MOST_LOSS_DB = 0.1  # by bounds; more is said
 # Bounding sphere of a file over that of its room, the first that loses no more. Content at infinity

@@ -33,8 +33,7 @@ from recon_cli.splats.lod import discard_levels
 from recon_cli.splats.registry import FORMATS, check_writable, load_splats
 from recon_cli.workspace import durable
 from recon_cli.workspace.atomic import sync_folder
-from recon_cli.workspace.export_formats import ExportFormat
-from recon_cli.workspace.export_record import LossLimit
+from recon_cli.workspace.export_formats import ExportFormat, LossLimit
 
 _VIEW_SIZE = 600  # pixels, longest side of the renders that a file is checked on
 _GUESSED_UP = "-y"  # of a file that does not say, as in viewers

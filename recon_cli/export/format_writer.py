@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
@@ -23,8 +24,8 @@ from recon_cli.room.texture import MOST_PIXELS, add_texture
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import write_points
-from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat
-from recon_cli.workspace.export_record import ExportedFile, loss_limit
+from recon_cli.workspace.export_formats import EXPORT_FORMATS, ExportFormat, LossLimit
+from recon_cli.workspace.summaries import ExportedFile
 
 logger = logging.getLogger("recon")
 
@@ -51,46 +52,50 @@ class FormatWriter:
     """Writes a scene, whose .ply exists already, in one format after the other."""
 
     def __init__(
-        self, scene: ReducedScene, out: Path, config: ExportConfig, source: ExportSource,
+        self, reduce: Callable[[], ReducedScene], config: ExportConfig, source: ExportSource,
         room_frame: RoomFrame | None,
     ) -> None:
-        self._scene, self._out, self._config = scene, out, config
+        self._reduce, self._config = reduce, config
         self._source, self._room_frame = source, room_frame
         self._known_db: dict[bool, float] = {}  # of the bounded scene and the other one
 
-    def write(self, row: ExportFormat) -> ExportedFile:
-        """Writes one format; ReconstructionError if it loses more than it may."""
+    def write(self, row: ExportFormat, out: Path, ply: Path) -> ExportedFile:
+        """Writes one format into `out`; ReconstructionError if it loses more than it may."""
         match row.kind:
             case "gaussians":
-                return self._write_gaussians(row)
+                return self._write_gaussians(row, out, ply)
             case "points":
                 trained = self._scene.trained
                 inside = trained.within(*self._source.room)
-                write_points(self._out / row.file, trained.select(inside))
+                write_points(out / row.file, trained.select(inside))
             case "cameras":
-                write_cameras(self._out, row, self._source)
+                write_cameras(out, row, self._source)
             case "mesh":
-                return self._write_mesh(row)
+                return self._write_mesh(row, out)
             case "plan":
                 assert self._room_frame is not None
                 centers = [camera.center for _, camera in self._source.place(
                     self._source.scene.train)]
-                write_plan(self._out, self._mesh, np.stack(centers), self._room_frame)
-        path = self._out / row.file
+                write_plan(out, self._mesh, np.stack(centers), self._room_frame)
+        path = out / row.file
         return ExportedFile(file=row.file, bytes=path.stat().st_size if path.is_file() else None)
 
-    def _write_gaussians(self, row: ExportFormat) -> ExportedFile:
-        path, scene = self._out / row.file, self._scene
+    @cached_property
+    def _scene(self) -> ReducedScene:
+        return self._reduce()
+
+    def _write_gaussians(self, row: ExportFormat, out: Path, ply: Path) -> ExportedFile:
+        path, scene = out / row.file, self._scene
         splats = scene.bounded if row.bounded else scene.trained
         before = self._psnr_db(splats, bounded=row.bounded)
-        limit = loss_limit(row.name, dataclasses.asdict(self._config))
+        limit = LossLimit.from_option(row, self._config.max_loss)
         limited = self._config.max_mb is not None and row.name == self._config.formats[0]
         gain = write_until_good(
             row, path, lower_degrees(splats, self._source).at(row.sh_degree),
             _settings(row, self._config, self._source), self._source.psnr,
             reference_db=before, limit=limit,
             max_bytes=int(1e6 * (self._config.max_mb or 0)) if limited else None)
-        size, ply_size = file_size(row, path), (self._out / "splats.ply").stat().st_size
+        size, ply_size = file_size(row, path), ply.stat().st_size
         text = f"{row.name}: {ply_size / size:.1f}x smaller, {gain:+.2f} dB"
         if not limit.allows(gain, before + gain):
             raise ReconstructionError(
@@ -102,10 +107,10 @@ class FormatWriter:
             file=row.file, bytes=size, smaller=round(ply_size / size, 3),
             psnr_change_db=round(gain, 4), psnr_db=round(before + gain, 4))
 
-    def _write_mesh(self, row: ExportFormat) -> ExportedFile:
+    def _write_mesh(self, row: ExportFormat, out: Path) -> ExportedFile:
         mesh = self._textured if "texture" in row.options and self._config.texture else (
             self._surface)
-        path = write_mesh_file(self._out / row.file, mesh, self._source.frame.up,
+        path = write_mesh_file(out / row.file, mesh, self._source.frame.up,
                                tint=self._config.inferred == "tint")
         share = (mesh.area(mesh.inferred_faces) / max(mesh.area(), 1e-30)
                  if mesh.inferred is not None else None)

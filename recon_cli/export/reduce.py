@@ -22,7 +22,7 @@ from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.train.importance import Importance, add_views
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
-from recon_cli.workspace.export_record import ExportChange
+from recon_cli.workspace.summaries import ExportChange
 
 if TYPE_CHECKING:  # the readers of views, which `recon convert` starts without
     from recon_cli.export.source import ExportSource

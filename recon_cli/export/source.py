@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -45,8 +45,8 @@ class ExportSource:
     """
 
     def __init__(
-        self, splats: Splats, inputs: StageInputs, frame: ExportFrame, ctx: StageContext, *,
-        antialiased: bool,
+        self, splats: Callable[[], Splats], inputs: StageInputs, frame: ExportFrame,
+        ctx: StageContext, *, antialiased: bool,
     ) -> None:
         self.frame, self.ctx, self.has_views = frame, ctx, has_views(inputs.folders)
         self._splats, self._inputs, self._antialiased = splats, inputs, antialiased
@@ -59,7 +59,7 @@ class ExportSource:
             return load_scene(self._inputs.folders, validation=self._run_config.validation)
         record = ImportRecord.read(self._inputs.folders["train"])
         assert record is not None, "trained without views"
-        imported = transformed(self._splats, self._similarity.inverse())
+        imported = transformed(self._splats(), self._similarity.inverse())
         return synthetic_scene(imported, up=record.up(), max_size=self._run_config.max_size)
 
     @cached_property
@@ -69,7 +69,7 @@ class ExportSource:
             return load_reference_psnr(
                 self.scene, self._similarity, self._run_config.max_size, self.ctx)
         cameras = [camera for _, camera in self.place(self.scene.train)]
-        psnr = SelfPsnr.from_renders(self._splats, cameras, self.ctx)
+        psnr = SelfPsnr.from_renders(self._splats(), cameras, self.ctx)
         self.ctx.notice(f"no views: checked on {psnr.describe()}")
         return psnr
 

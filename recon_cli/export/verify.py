@@ -22,8 +22,7 @@ from recon_cli.scene.splats import Splats, with_rows
 from recon_cli.splats.format import WriteSettings
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.registry import FORMATS
-from recon_cli.workspace.export_formats import ExportFormat
-from recon_cli.workspace.export_record import LossLimit
+from recon_cli.workspace.export_formats import ExportFormat, LossLimit
 
 _VIEWS = 8  # rendered for each file, at most
 

@@ -22,7 +22,7 @@ logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True)
-class Removal:
+class CleanItem:
     """Something that is removed, and its size in bytes."""
 
     path: Path
@@ -34,8 +34,8 @@ class Removal:
 def free_space(
     job: Job, stages: Sequence[str] = (), *, states: bool = False, renders: bool = False,
     keep_exports: bool = False, dry: bool = False,
-    show: Callable[[Sequence[Removal]], None] = lambda _removals: None,
-) -> tuple[Removal, ...]:
+    show: Callable[[Sequence[CleanItem]], None] = lambda _removals: None,
+) -> tuple[CleanItem, ...]:
     """Removes dispensable files and returns them, after `show`; with `dry` nothing is removed.
 
     That is unfinished work, replaced results and large volatile files; with `states` also those
@@ -53,13 +53,13 @@ def free_space(
     with disk_errors(workspace.root, "cleaning"), workspace.writing("clean"):
         if keep_exports:
             stages = _all_but_exports(job)
-        results = [workspace.folder(stage) for stage in stages]
+        results = [path for stage in stages for path in workspace.result_paths(stage)]
         frames = workspace.renders() if renders else []
         others = [] if stages and not keep_exports else [
             path for path in (*_spare(job, states=states), *frames)
             if not any(path.is_relative_to(result) for result in results)]
         removals = tuple(
-            Removal(path, size_of(path), path.is_symlink(), _stage_of(job, path))
+            CleanItem(path, size_of(path), path.is_symlink(), _stage_of(job, path))
             for path in (*others, *results) if os.path.lexists(path))
         show(removals)
         if dry:

@@ -6,12 +6,13 @@ import dataclasses
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from recon_cli import machine
 from recon_cli.config.fields import StageConfig
@@ -56,6 +57,7 @@ class Job:
     table: Sequence[Stage] = STAGES
     # called while Gaussians are trained; they do not affect the result
     callbacks: tuple[TrainCallback, ...] = ()
+    shared: dict[Hashable, Any] = field(default_factory=dict)  # by a stage with its parts
     asked: tuple[str, ...] = ()  # the stages that run, where that is known
     deadline: Deadline = field(default_factory=Deadline)  # for what stages may do without
 
@@ -79,9 +81,10 @@ def run_stage(
     if sources is None:
         sources = _read_last_sources(job, row) if row.input_metavar else ()
     key = ResultKey(
-        row.name, row.version, config.hashed_fields(), sources, checks.upstream(row),
+        row.name, row.version, row.key_options(config), sources, checks.upstream(row),
         verb=row.verb)
-    _warn_of_stale_uses(checks, row)
+    if not row.part:  # else its stage has said so
+        _warn_of_stale_uses(checks, row)
     if again:
         workspace.discard(row.name)
     key = dataclasses.replace(key, continues=find_start(workspace, row, key, start))
@@ -90,9 +93,7 @@ def run_stage(
         tuple(Path(source.path) for source in sources),
         workspace.folder(row.name) if key.continues else None,
         {name: digest for name, digest in key.upstream.items() if digest},
-        _find_earlier(workspace, row, key, again=again), again)
-    if row.adds:  # unfinished work may hold links to the files of the last result
-        workspace.discard(row.name)
+        _find_earlier(workspace, row, key, again=again), row.part)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
     from recon_cli.workspace.records import name_photos  # imports numpy
@@ -106,7 +107,7 @@ def run_stage(
             summary: JsonRecord = run_it(
                 config, inputs, out,
                 dataclasses.replace(ctx, while_idle=while_idle, name_photos=rename))
-    outputs = workspace.seal(row.name, without=summary.not_recorded())
+    outputs = workspace.seal(row.name)
     run = RunRecord(
         seconds=round(earlier.seconds + meter.seconds, 3),
         peak_memory_bytes=meter.peak_memory_bytes, summary=summary.to_json(),
@@ -122,16 +123,13 @@ def run_stage(
 def _find_earlier(
     workspace: Workspace, row: Stage, key: ResultKey, *, again: bool
 ) -> EarlierResult | None:
-    """Returns the result that a stage adds to, or continues as only late options differ.
-
-    What a result held that is added to is not known by a damaged manifest.
-    """
+    """Returns the result whose edits a stage reads, or that it continues: late options differ."""
     folder = workspace.folder(row.name)
     try:
         finished = workspace.manifest(row.name)
     except ManifestError:
-        return EarlierResult(folder, {}) if row.adds else None
-    if finished is None or not (row.adds or row.edits or (row.late and not again and (
+        return None
+    if finished is None or not (row.edits or (row.late and not again and (
             _without(finished.key, row.late) == _without(key, row.late)))):
         return None
     present = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")
@@ -266,7 +264,7 @@ def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> S
         context = render_context(job.compute, job.progress)
         return dataclasses.replace(
             context, record=record, callbacks=job.callbacks, scratch=job.workspace.partial(""),
-            compute=job.compute, deadline=job.deadline)
+            compute=job.compute, deadline=job.deadline, shared=job.shared)
     threads = job.compute.threads or machine.usable_threads()
     return StageContext(
         progress=job.progress, threads=threads, record=record, deadline=job.deadline)

@@ -100,7 +100,7 @@ class WorkspaceCheck:
         self._tolerant = tolerant
         self._workspace = workspace
         self._settings = settings
-        self._rows = {row.name: row for row in table}
+        self._rows = {row.name: row for top in table for row in (top, *top.parts)}
         self._checks: dict[str, StageCheck] = {}
 
     def row(self, name: str) -> Stage:
@@ -176,8 +176,10 @@ class WorkspaceCheck:
         digests: dict[str, str | None] = {}
         for name in (*row.needs, *row.uses):
             check = self.check(name)
-            usable = check.usable or (name in row.needs and check.manifest)
-            digests[name] = check.manifest.digest if usable and check.manifest else None
+            digests[name] = None
+            if check.manifest and (check.usable or name in row.needs):
+                digests[name] = check.manifest.digest if name not in row.reads else (
+                    check.manifest.digest_of(row.reads[name]))
         return digests
 
     def _compare(
@@ -208,7 +210,8 @@ class WorkspaceCheck:
                        if name in keys[1].config and not _accepts(row.config, name, value)}
         version_reasons += [f"{section}.{name} no longer takes {str(value)[:40]}"
                             for name, value in gone_values.items()]
-        without = (*row.config.per_file_fields(), *gone_values)
+        without = {*gone_values, *(item.name for item in dataclasses.fields(row.config)
+                                   if row.options is not None and item.name not in row.options)}
         version_reasons += version_differences(*keys, section=section, without=without, late=late)
         reasons += differences(*keys, section=section, without=without, late=late)
         reasons += find_changed_outputs(
@@ -230,7 +233,7 @@ class WorkspaceCheck:
         for need in row.needs:  # a missing result may well come out as it was
             upstream[need] = upstream[need] or stored.upstream.get(need)
         return ResultKey(
-            row.name, row.version, config.hashed_fields(), sources, upstream, stored.continues,
+            row.name, row.version, row.key_options(config), sources, upstream, stored.continues,
             row.verb)
 
     def _read_again(self, stored: tuple[Source, ...]) -> tuple[tuple[str, ...], tuple[Source, ...]]:

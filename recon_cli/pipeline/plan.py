@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
-from recon_cli.errors import StageError
+from recon_cli.errors import ReconError, StageError, WorkspaceError
 from recon_cli.pipeline.compile_ahead import compile_ahead
 from recon_cli.pipeline.continuation import Start, is_imported, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
@@ -72,7 +72,9 @@ def status(job: Job) -> tuple[StageStatus, ...]:
     """
     checks = WorkspaceCheck(job.workspace, job.settings, job.table, tolerant=True)
     with disk_errors(job.workspace.root, "reading the workspace"):
-        return tuple(_status(checks.check(row.name)) for row in job.table)
+        return tuple(
+            _status(check) for row in job.table
+            for check in (checks.check(row.name), *check_parts(job, row.name)))
 
 
 def _status(check: StageCheck) -> StageStatus:
@@ -114,19 +116,54 @@ def run(
                 for outcome in _bring_up_to_date(job, target, again=again):
                     job.report(outcome)
                     outcomes.append(outcome)
-        for outcome in outcomes:
-            _raise_failure(job, outcome)
+                outcomes += _make_parts(job, target, again=again)
     return tuple(outcomes)
 
 
-def _raise_failure(job: Job, outcome: Outcome) -> None:
-    """Raises the failure of a stage that has run, though its result is worth keeping."""
-    if not outcome.ran:
-        return
-    row = next(row for row in job.table if row.name == outcome.stage)
-    failure = row.summary.from_json(outcome.manifest.run.summary).failure()
-    if failure is not None:
-        raise failure
+def _make_parts(job: Job, target: Target, *, again: bool) -> list[Outcome]:
+    """Brings the parts of a target up to date that are asked for, and names others that are stale.
+
+    One that fails takes nothing from the others; its error is raised at the end.
+    """
+    outcomes: list[Outcome] = []
+    errors: list[ReconError] = []
+    for part in target.config.parts:
+        own = dataclasses.replace(target, stage=f"{target.stage}.{part}")
+        try:
+            for outcome in _bring_up_to_date(job, own, again=again):
+                job.report(outcome)
+                outcomes.append(outcome)
+        except WorkspaceError:
+            raise
+        except ReconError as error:
+            if target.config.excuses(error):
+                logger.warning("%s was not written: %s %s", own.stage, error.message, error.hint)
+            else:
+                errors.append(error)
+    for check in check_parts(job, target.stage):
+        if check.manifest and not check.fresh and check.row.part not in target.config.parts:
+            logger.warning("%s is %s. It is kept; --format %s writes it again.",
+                           check.manifest.run.summary["file"], check.describe(), check.row.part)
+    if errors:
+        raise _join_errors(errors, outcomes)
+    return outcomes
+
+
+def _join_errors(errors: Sequence[ReconError], outcomes: Sequence[Outcome]) -> ReconError:
+    """Returns the first error, with what the others say and what was written nevertheless."""
+    error, files = errors[0], [str(one.manifest.run.summary["file"]) for one in outcomes]
+    message = " ".join(dict.fromkeys(one.message for one in errors))
+    error.message = f"{message} Written: {', '.join(files)}." if files else message
+    error.hint = " ".join(dict.fromkeys(one.hint for one in errors if one.hint))
+    error.args = (error.message,)
+    return error
+
+
+def check_parts(job: Job, stage: str) -> tuple[StageCheck, ...]:
+    """Returns how the parts of a stage stand that are there, or were begun."""
+    checks = WorkspaceCheck(job.workspace, job.settings, job.table, tolerant=True)
+    found = (checks.check(part.name) for part in checks.row(stage).parts)
+    return tuple(check for check in found if check.state != "missing")
 
 
 def refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
@@ -243,7 +280,8 @@ def _bring_up_to_date(job: Job, target: Target, *, again: bool) -> Iterator[Outc
         checks = job.inspect()
         plan(checks, row.name)  # a fresh stage may have become stale by the last one
         fresh = None if again else _find_fresh(job, checks, target, sources)
-    warn_of_other_versions(map(checks.check, row.needs), row.verb)
+    if not row.part:  # else its stage has said so
+        warn_of_other_versions(map(checks.check, row.needs), row.verb)
     if fresh is None:
         _require_states(job, checks, row)
         start = Start.ANEW if again and target.start is Start.AUTO else target.start

@@ -21,7 +21,7 @@ from recon_cli.evaluation.scores import Metrics
 from recon_cli.pipeline.execute import Job, last_sources
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.capture import read_capture
-from recon_cli.report.curves import draw_prune_curve, draw_rounds, draw_training_curves
+from recon_cli.report.curves import draw_rounds, draw_training_curves
 from recon_cli.report.gallery import (
     GAIN,
     MAX_FILE_BYTES,
@@ -47,9 +47,9 @@ from recon_cli.report.trust_section import read_trust
 from recon_cli.splats.html import ICON
 from recon_cli.trust.quality import delivered_model
 from recon_cli.workspace import atomic
-from recon_cli.workspace.export_record import ExportSummary
 from recon_cli.workspace.layout import disk_errors
 from recon_cli.workspace.records import name_photos
+from recon_cli.workspace.summaries import ExportSummary
 
 FILE = "report.html"
 _SUFFIXES = (".html", ".htm")
@@ -153,8 +153,7 @@ def _template_values(
         "decisions": read_decisions(stages["train"]), "damaged": damaged,
         "delivered": delivered_model(metrics),
         "scores": build_scores(metrics) if metrics and metrics.models else None,
-        "sweep": draw_prune_curve(root, stages), "rounds": draw_rounds(stages["prune"]),
-        "sweep_command": f"recon prune --sweep -w {shlex.quote(str(root))}",
+        "rounds": draw_rounds(stages["prune"]),
         "part_command": f"recon sfm -w {shlex.quote(str(root))} --part",
         "provenance": read_provenance(stages), "labels": MODEL_LABELS,
         "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),

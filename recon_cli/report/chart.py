@@ -11,9 +11,8 @@ from markupsafe import Markup
 
 WIDTH, HEIGHT = 480, 300  # of the drawing; the page scales it
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 12, 44
-_TOP_AXIS = 34  # more room above for a second x axis
 _TICK_CHARS = 62  # pixels that a label of the x axis takes
-MARKS = ("circle", "square", "diamond", "triangle", "cross", "ring", "plus", "bar")
+MARKS = ("circle", "square", "diamond", "triangle", "cross", "ring", "plus")
 
 _STEPS = (1.0, 2.0, 5.0, 10.0)  # a tick lies at a multiple of one of these and a power of ten
 _NEAR_ZERO = 0.2  # of the highest value
@@ -61,14 +60,10 @@ class Scale:
         return (log_ticks if self.log else linear_ticks)(self.low, self.high, most)
 
 
-def draw_chart(
-    title: str, x: Axis, y: Axis, series: Sequence[Series], *,
-    above: tuple[str, float] | None = None,
-) -> Markup:
+def draw_chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> Markup:
     """Returns a figure with caption and legend, or a sentence where there is nothing to draw.
 
-    Later series are drawn over earlier ones. `above` is the label of a second x axis, and the
-    number of its units in one of `x`.
+    Later series are drawn over earlier ones.
     """
     lines = []
     for line in series:  # without the points that the axes cannot show
@@ -79,16 +74,13 @@ def draw_chart(
     if not lines:
         return Markup('<figure class="chart"><figcaption>{}</figcaption>'
                       '<p class="empty">Nothing was recorded.</p></figure>').format(title)
-    top = _TOP + (_TOP_AXIS if above else 0)
     across = _fit_scale([p[0] for line in lines for p in line.points], x, WIDTH - _LEFT - _RIGHT)
-    up = _fit_scale([p[1] for line in lines for p in line.points], y, HEIGHT - top - _BOTTOM)
+    up = _fit_scale([p[1] for line in lines for p in line.points], y, HEIGHT - _TOP - _BOTTOM)
 
     def place(point: tuple[float, float]) -> tuple[float, float]:
         return _LEFT + across(point[0]), HEIGHT - _BOTTOM - up(point[1])
 
-    parts = _draw_axes(x, y, across, up, top)
-    if above:
-        parts += _draw_top_axis(above, across, x, top)
+    parts = _draw_axes(x, y, across, up)
     parts += [
         _line_path(line, "L".join(f"{x:.1f},{y:.1f}" for x, y in map(place, line.points)))
         for line in lines if line.line]
@@ -110,9 +102,8 @@ def draw_mark(shape: str, x: float, y: float, r: float, color: int, title: str =
         "triangle": f"M{x:.1f},{y - 1.2 * r:.1f}l{1.1 * r},{2 * r}h{-2.2 * r}z",
         "cross": f"M{x - r:.1f},{y - r:.1f}l{2 * r},{2 * r}m{-2 * r},0l{2 * r},{-2 * r}",
         "plus": f"M{x - r:.1f},{y:.1f}h{2 * r}m{-r},{-r}v{2 * r}",
-        "bar": f"M{x - 1.4 * r:.1f},{y:.1f}h{2.8 * r}",
     }
-    hollow = " hollow" if shape in ("ring", "cross", "plus", "bar") else ""
+    hollow = " hollow" if shape in ("ring", "cross", "plus") else ""
     return Markup('<path class="mark c{}{}" d="{}">{}</path>').format(
         color, hollow, paths[shape], Markup("<title>{}</title>").format(title) if title else "")
 
@@ -171,7 +162,7 @@ def _fit_scale(values: Sequence[float], axis: Axis, length: float) -> Scale:
     return Scale(low, high, axis.log, length)
 
 
-def _draw_axes(x: Axis, y: Axis, across: Scale, up: Scale, top: int) -> list[Markup]:
+def _draw_axes(x: Axis, y: Axis, across: Scale, up: Scale) -> list[Markup]:
     floor, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
     grid_line = Markup('<line class="grid" x1="{}" x2="{}" y1="{}" y2="{}"/>')
     parts = []
@@ -181,26 +172,15 @@ def _draw_axes(x: Axis, y: Axis, across: Scale, up: Scale, top: int) -> list[Mar
                   _draw_text(_LEFT - 7, at + 4, tick_label(tick), "end")]
     for tick in across.ticks(round(across.length / _TICK_CHARS)):
         at = round(_LEFT + across(tick), 1)
-        parts += [grid_line.format(at, at, top, floor),
+        parts += [grid_line.format(at, at, _TOP, floor),
                   _draw_text(at, floor + 17, tick_label(tick), "middle")]
-    middle = round((top + floor) / 2, 1)
+    middle = round((_TOP + floor) / 2, 1)
     return [
         *parts,
-        Markup('<path class="axis" d="M{},{}V{}H{}"/>').format(_LEFT, top, floor, right),
+        Markup('<path class="axis" d="M{},{}V{}H{}"/>').format(_LEFT, _TOP, floor, right),
         _draw_text((_LEFT + right) / 2, HEIGHT - 7, x.label, "middle"),
         Markup('<text class="label" x="13" y="{}" text-anchor="middle" '
                'transform="rotate(-90 13 {})">{}</text>').format(middle, middle, y.label)]
-
-
-def _draw_top_axis(above: tuple[str, float], across: Scale, x: Axis, top: int) -> list[Markup]:
-    label, factor = above
-    scale = Scale(across.low * factor, across.high * factor, x.log, across.length)
-    parts = [_draw_text((_LEFT + WIDTH - _RIGHT) / 2, 13, label, "middle")]
-    for tick in scale.ticks(round(across.length / _TICK_CHARS)):
-        at = round(_LEFT + scale(tick), 1)
-        parts += [Markup('<line class="axis" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(
-            at, at, top, top - 5), _draw_text(at, top - 9, tick_label(tick), "middle")]
-    return parts
 
 
 def _draw_text(x: float, y: float, text: str, anchor: str) -> Markup:

@@ -1,21 +1,19 @@
-"""The charts of the page: training and pruning logs, pruning rounds, the prune curve."""
+"""The charts of the page: training and pruning logs, and pruning rounds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
 
 from markupsafe import Markup
 
 from recon_cli.errors import FormatError
-from recon_cli.evaluation.scores import Metrics, Sweep
-from recon_cli.report.chart import MARKS, Axis, Series, draw_chart
-from recon_cli.report.records import BASE, PRUNED, read_log, read_sweep
+from recon_cli.evaluation.scores import Metrics
+from recon_cli.report.chart import Axis, Series, draw_chart
+from recon_cli.report.records import BASE, PRUNED, read_log
 from recon_cli.report.stage_status import StageReport, StageReports
 from recon_cli.workspace.digests import digest_file
-from recon_cli.workspace.summaries import LogRow, PruneSummary, TrainSummary
+from recon_cli.workspace.summaries import LogRow, PruneSummary
 
 _STEP, _DECIBELS, _LEFT = Axis("step"), Axis("PSNR, dB"), Axis("Gaussians left")
 _LOG = "log.jsonl"
@@ -29,15 +27,6 @@ class TrainingCurves:
     figures: tuple[Markup, ...]
     notes: tuple[str, ...]  # on how to read them, a sentence each
     damaged: tuple[str, ...]  # why a log is not shown
-
-
-@dataclass(frozen=True)
-class PruneCurve:
-    """The chart of a prune sweep."""
-
-    figure: Markup | None = None  # None without a sweep
-    stale: str = ""  # why it does not belong to the present training
-    damaged: str = ""  # why an existing sweep is not shown
 
 
 def draw_training_curves(stages: StageReports, metrics: Metrics | None) -> TrainingCurves:
@@ -108,64 +97,3 @@ def draw_rounds(prune: StageReport) -> Markup | None:
             Series("rounds", points(kept=True), 1, "circle"),
             Series("taken back", points(kept=False), 3, "cross", line=False),
             Series("before the first removal", start, 0, "diamond", line=False, big=True)])
-
-
-def draw_prune_curve(root: Path, stages: StageReports) -> PruneCurve:
-    """Returns validation PSNR against Gaussians and megabytes of a sweep, its models marked."""
-    path = root / Sweep.FILE
-    if not path.is_file():
-        return PruneCurve()
-    try:
-        sweep = read_sweep(path)
-    except FormatError as error:
-        return PruneCurve(damaged=f"The sweep is not shown: {error.message}")
-    controls = tuple((trial.gaussians, trial.recovered.psnr_db) for trial in sweep.trials
-                     if trial.score == Sweep.CONTROL and trial.ratio is None)
-    train = stages["train"].read_summary(TrainSummary)
-    ply = stages["train"].folder / "splats.ply"  # all rows are equally long
-    megabytes = ply.stat().st_size / train.gaussians / 1e6 if train and ply.is_file() else None
-    figure = draw_chart(
-        f"PSNR on {sweep.validation_views} validation views after {sweep.recovery_steps} steps of "
-        "recovery", _LEFT, _DECIBELS, [
-            *_sweep_series(sweep),
-            *_mark_model(stages["train"], TrainSummary, "original model", 0, "diamond"),
-            *_mark_model(stages["prune"], PruneSummary, "compact model", 1, "triangle"),
-            Series("no prune, as many steps", controls, 7, "bar", line=False, big=True)],
-        above=("megabytes of the .ply", megabytes) if megabytes else None)
-    return PruneCurve(figure, _why_stale(path, sweep, stages["train"]))
-
-
-def _sweep_series(sweep: Sweep) -> list[Series]:
-    scores = dict.fromkeys(trial.score for trial in sweep.trials if trial.score != Sweep.CONTROL)
-    trials = sorted(sweep.trials, key=lambda trial: trial.gaussians)
-    used = sweep.equal_seconds_of  # drawn last, on top
-    return [Series(
-        score, tuple((trial.gaussians, trial.recovered.psnr_db)
-                     for trial in trials if trial.score == score),
-        color=1 if score == used else 2 + number % 6, mark=MARKS[number % 4],
-        dashed=score == "random")
-        for number, score in enumerate(sorted(scores, key=lambda score: score == used))]
-
-
-def _mark_model(
-    stage: StageReport, kind: type[TrainSummary] | type[PruneSummary], label: str, color: int,
-    mark: str,
-) -> list[Series]:
-    summary = stage.read_summary(kind)
-    if summary is None or summary.validation_psnr_db is None:
-        return []
-    return [Series(
-        label + stage.stale_suffix, ((summary.gaussians, summary.validation_psnr_db),), color, mark,
-        line=False, big=True)]
-
-
-def _why_stale(path: Path, sweep: Sweep, train: StageReport) -> str:
-    """Returns why a sweep does not belong to the present training; empty if it does."""
-    if train.manifest is None:
-        return "the training that it started from is gone"
-    if sweep.of_train is not None:
-        if sweep.of_train != train.manifest.digest:
-            return "it started from another training"
-    elif path.stat().st_mtime < datetime.fromisoformat(train.manifest.run.finished).timestamp():
-        return "it is older than the training"
-    return "" if train.fresh else f"the training that it started from is stale: {train.why}"

@@ -20,9 +20,8 @@ from recon_cli.splats.html import find_title
 from recon_cli.trust.quality import Quality, delivered_model, describe_quality, name_view
 from recon_cli.trust.scene_trust import TrustRecord
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
-from recon_cli.workspace.export_record import ExportedFile, ExportSummary, main_file
 from recon_cli.workspace.records import FOLDER, Frame, read_frame_list
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import ExportedFile, ExportSummary, SfmSummary
 
 _SIDE, _QUALITY = 1280, 86
 
@@ -71,8 +70,9 @@ def build_opening(stages: StageReports, metrics: Metrics | None, page: Path) -> 
 
 def _find_name(stages: StageReports) -> str:
     """Returns the title of the page, as that of an exported one: given, or the capture's name."""
-    export, ingest = stages["export"].manifest, stages["ingest"].manifest
-    given = export.key.config.get("title") if export else None
+    ingest = stages["ingest"].manifest
+    given = next((part.manifest.key.config.get("title") for part in stages["export"].parts
+                  if part.name == "export.html" and part.manifest), None)
     sources = ingest.key.sources if ingest else ()
     return str(given) if given else find_title(Path(sources[0].path).name if sources else "")
 
@@ -114,14 +114,15 @@ def _link_files(export: StageReport, page: Path) -> Iterator[ExportLink]:
         return
     yield ExportLink(summary.file, _link(export.folder / summary.file, page), summary.bytes, 1.0,
                      "exact", "")
-    for name, file in (summary.files or {}).items():
-        path = export.folder / file.file
-        size = path.stat().st_size if file.bytes is None and path.is_file() else file.bytes
-        first = main_file(name, file.file) if name in EXPORT_FORMATS else file.file
+    for part in export.parts:
+        file = part.read_summary(ExportedFile)
+        if file is None:
+            continue
+        first = export.folder / EXPORT_FORMATS[part.name.partition(".")[2]].main_file
         yield ExportLink(
-            file.file, _link(export.folder / first, page), size,
+            file.file, _link(first, page), file.bytes,
             file.bytes / summary.bytes if file.bytes is not None and summary.bytes else None,
-            _describe_change(file), file.stale or "")
+            _describe_change(file), "" if part.fresh else part.why)
 
 
 def _describe_change(file: ExportedFile) -> str:

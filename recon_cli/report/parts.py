@@ -114,7 +114,7 @@ def number_frames(frames: Sequence[Frame], parts: Sequence[PartSummary]) -> list
 
 
 @dataclass(frozen=True)
-class Gap:
+class PartGap:
     """The gap between two parts in the order of the frames."""
 
     numbers: tuple[int, int]
@@ -131,11 +131,11 @@ class Gap:
         return float(times[1] or 0.0) - float(times[0] or 0.0), self.lost
 
 
-def find_moments(frames: Sequence[Frame], parts: Sequence[PartSummary]) -> list[Gap]:
+def find_moments(frames: Sequence[Frame], parts: Sequence[PartSummary]) -> list[PartGap]:
     """Returns the shortest gaps that join all parts with each other, in the order of the frames."""
     numbers = number_frames(frames, parts)
     rows = [row for row, number in enumerate(numbers) if number]
-    gaps = [Gap((numbers[row], numbers[other]), frames[row], frames[other], other - row - 1)
+    gaps = [PartGap((numbers[row], numbers[other]), frames[row], frames[other], other - row - 1)
             for row, other in itertools.pairwise(rows) if numbers[row] != numbers[other]]
     group = list(range(len(parts) + 1))  # of parts that are joined by now, by any of their numbers
     chosen = []
@@ -147,7 +147,7 @@ def find_moments(frames: Sequence[Frame], parts: Sequence[PartSummary]) -> list[
     return [gap for gap in gaps if gap in chosen][:_MOST]
 
 
-def _read_moment(ingest: Path, gap: Gap, *, panoramas: bool) -> Moment:
+def _read_moment(ingest: Path, gap: PartGap, *, panoramas: bool) -> Moment:
     pictures = [
         data_uri(fit_image(read_png(ingest / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY)
         for frame in (gap.before, gap.after)]
@@ -157,7 +157,7 @@ def _read_moment(ingest: Path, gap: Gap, *, panoramas: bool) -> Moment:
                   advise(gap, panoramas=panoramas))
 
 
-def advise(gap: Gap, *, panoramas: bool = False) -> str:
+def advise(gap: PartGap, *, panoramas: bool = False) -> str:
     """Returns a sentence on where to film to join two parts."""
     first, second = _format_time(gap.before), _format_time(gap.after)
     if panoramas and not (first and second):

@@ -1,4 +1,4 @@
-"""Scores, logs and sweeps of a workspace, and the tables of scores on the page.
+"""Scores and logs of a workspace, and the tables of scores on the page.
 
 The files of a stale stage may have been edited by hand, and no digest covers logs: unexpected
 content becomes a FormatError, which the page shows in its place.
@@ -15,9 +15,8 @@ from pathlib import Path
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval
-from recon_cli.evaluation.scores import Metrics, ModelMetrics, Sweep, Table, or_dash
+from recon_cli.evaluation.scores import Metrics, ModelMetrics, Table, or_dash
 from recon_cli.progress import format_megabytes
-from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.summaries import LogRow
 
 BASE, PRUNED = MODELS = ("base", "pruned")
@@ -40,12 +39,6 @@ def read_log(path: Path) -> tuple[LogRow, ...]:
         return LogRow.read_all(path)
 
 
-def read_sweep(path: Path) -> Sweep:
-    """Returns the content of a sweep.json; FormatError if it is damaged."""
-    with _format_errors(path):
-        return Sweep.from_json(read_json(path, dict))
-
-
 @contextmanager
 def _format_errors(path: Path) -> Iterator[None]:
     try:
@@ -57,7 +50,7 @@ def _format_errors(path: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Scores:
+class ScoreTables:
     """The tables of the page."""
 
     models: Table  # side by side
@@ -68,7 +61,7 @@ class Scores:
     notes: tuple[str, ...]  # which held-out views are not scored, a sentence each
 
 
-def build_scores(metrics: Metrics) -> Scores:
+def build_scores(metrics: Metrics) -> ScoreTables:
     """Returns the tables of the scores of evaluate."""
     models = {key: metrics.models[key] for key in MODELS if key in metrics.models}
     notes = [f"{metrics.coverage[0].upper()}{metrics.coverage[1:]}."] if metrics.coverage else []
@@ -81,7 +74,7 @@ def build_scores(metrics: Metrics) -> Scores:
     notes += [f"{MODEL_LABELS[key].capitalize()}: {moving}." for key, model in models.items()
               if (moving := metrics.describe_moving(model))]
     conventions = {title: getattr(metrics, f"{key}_convention") for key, title in _TITLES.items()}
-    return Scores(
+    return ScoreTables(
         _model_table(models), _gap_table(models),
         _difference_table(metrics.pruned_minus_base) if metrics.pruned_minus_base else None,
         _view_table(models), tuple((title, text) for title, text in conventions.items() if text),

@@ -17,7 +17,7 @@ _MOST_BYTES = 3_000_000  # of a plan; the page has a limit of its own
 
 
 @dataclass(frozen=True)
-class Room:
+class RoomSection:
     """The section on the room."""
 
     figures: tuple[tuple[str, str], ...]  # (label, value with its interval)
@@ -25,7 +25,7 @@ class Room:
     plan: Markup | None  # data URI, in which nothing needs escaping; None if it cannot be shown
 
 
-def read_room(export: StageReport) -> Room | None:
+def read_room(export: StageReport) -> RoomSection | None:
     """Returns the measures of the last export; None where it wrote no plan."""
     path = export.folder / MEASURES
     if not export.there or not path.exists():
@@ -42,13 +42,12 @@ def read_room(export: StageReport) -> Room | None:
                 f"{wall['value']:.2f} ± {max(wall['error'], 0.01):.2f} m"
                 for wall in value["walls"])))
         notes = [str(note) for note in value["notes"]]
-        stale = export.summary.get("files", {}).get(PLAN, {}).get("stale")
-        if stale:
-            notes.insert(0, f"The plan is stale: {stale}.")
+        notes[:0] = [f"The plan is stale: {part.why}." for part in export.parts
+                     if part.name == f"export.{PLAN}" and not part.fresh]
         drawing = read_bytes(export.folder / PLAN)
     except (FormatError, OSError, KeyError, TypeError, ValueError) as error:
-        return Room((), (f"The measures are not shown: {error}",), None)
+        return RoomSection((), (f"The measures are not shown: {error}",), None)
     plan = None
     if len(drawing) <= _MOST_BYTES:
         plan = Markup("data:image/svg+xml;base64," + base64.b64encode(drawing).decode())
-    return Room(tuple(figures), tuple(notes), plan)
+    return RoomSection(tuple(figures), tuple(notes), plan)

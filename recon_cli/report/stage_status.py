@@ -35,6 +35,7 @@ class StageReport:
     command: str  # brings it up to date
     manifest: Manifest | None = None  # None without a result that can be trusted
     gone: tuple[str, ...] = ()  # inputs that no longer exist
+    parts: tuple[StageReport, ...] = ()  # results beside its own that are there: exported formats
 
     @property
     def fresh(self) -> bool:
@@ -94,7 +95,9 @@ def _inspect_stage(inspection: WorkspaceCheck, row: Stage, job: Job) -> StageRep
         reasons.insert(0, f"a run was interrupted at {partial.done} of {partial.total}")
     return StageReport(
         row.name, folder, check.state, "; ".join(filter(None, reasons)),
-        _command(inspection, check, root), check.manifest, check.gone)
+        _command(inspection, check, root), check.manifest, check.gone, tuple(
+            part for part in (_inspect_stage(inspection, part, job) for part in row.parts)
+            if part.there))
 
 
 def _command(inspection: WorkspaceCheck, check: StageCheck, root: Path) -> str:

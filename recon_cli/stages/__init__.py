@@ -5,7 +5,9 @@ IMPORT is the row of a scene that was imported: it takes the place (and folder) 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.fields import StageConfig
@@ -18,10 +20,17 @@ from recon_cli.config.stages import (
     SfmConfig,
     TrainConfig,
 )
-from recon_cli.workspace import export_record
+from recon_cli.workspace.export_formats import (
+    EXPORT_FORMATS,
+    FORMAT_OPTIONS,
+    TRANSFORM,
+    ExportFormat,
+)
 from recon_cli.workspace.summaries import (
     DenoiseSummary,
     EvaluateSummary,
+    ExportedFile,
+    ExportSummary,
     ImportSummary,
     IngestSummary,
     JsonRecord,
@@ -55,13 +64,42 @@ class Stage:
     optional_when_imported: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
     # another version of recon may have made its needs: it only shows, scores or writes the scene
     reads_other_versions: bool = False
-    adds: bool = False  # it keeps the files of its last result that it does not write again
     # options that decide its last steps alone: where they are all that differs, it is given its
     # last result to continue
     late: tuple[str, ...] = ()
     # folder of outputs that a user may change, remove or add: the next run is given its last result
     # to read them from
     edits: str = ""
+    options: tuple[str, ...] | None = None  # of `config` that decide its result; None: all
+    # patterns of the outputs that decide its result, of the stages of which not all do
+    reads: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    parts: tuple[Stage, ...] = ()  # results beside its own in its folder, each made by itself
+
+    @property
+    def part(self) -> str:
+        """The name that a part has in its stage; empty for a stage."""
+        return self.name.partition(".")[2]
+
+    def key_options(self, config: StageConfig) -> dict[str, Any]:
+        """Returns the options that decide the result, for its fingerprint."""
+        return {name: value for name, value in config.hashed_fields().items()
+                if self.options is None or name in self.options}
+
+
+_EXPORT_VERSION = 7
+_SCENE_OPTIONS = tuple(item.name for item in fields(ExportConfig)
+                       if item.name not in FORMAT_OPTIONS)
+
+
+def _format_stage(row: ExportFormat) -> Stage:
+    """Returns the row of an exported format, which fits the .ply or, of cameras, its frame."""
+    cameras = row.kind == "cameras"
+    return Stage(
+        f"export.{row.name}", "export", ("ingest", "sfm", "train", "export"),
+        () if cameras else ("prune",), ExportConfig, ExportedFile, _EXPORT_VERSION, False,
+        "recon_cli.stages.export", renders=True, optional_when_imported=("ingest", "sfm"),
+        reads_other_versions=True, options=row.key_options,
+        reads={"train": (), "export": (TRANSFORM,)} if cameras else {})
 
 
 STAGES: tuple[Stage, ...] = (
@@ -82,14 +120,15 @@ STAGES: tuple[Stage, ...] = (
           EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True,
           reads_other_versions=True),
     Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
-          export_record.ExportSummary, export_record.VERSION, False, "recon_cli.stages.export",
-          renders=True, optional_when_imported=("ingest", "sfm"), reads_other_versions=True,
-          adds=True))
+          ExportSummary, _EXPORT_VERSION, False, "recon_cli.stages.export", renders=True,
+          optional_when_imported=("ingest", "sfm"), reads_other_versions=True,
+          options=_SCENE_OPTIONS,
+          parts=tuple(map(_format_stage, list(EXPORT_FORMATS.values())[1:]))))
 
 IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, input_metavar="FILE")
 
 
 def stage(name: str) -> Stage:
-    """Returns the row of a stage by its name."""
-    return next(row for row in STAGES if row.name == name)
+    """Returns the row of a stage, or of a part of one, by its name."""
+    return next(row for top in STAGES for row in (top, *top.parts) if row.name == name)

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from recon_cli.errors import ManifestError, ReconError
+from recon_cli.errors import ManifestError
 
 KEY = "key"  # in the metadata of a field
 _HINT = "Run the stage that wrote it again with --again."
@@ -30,14 +30,6 @@ class JsonRecord:
     def contradictions(self, options: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG002
         """Returns why `options` that take no part in the fingerprint would give another result."""
         return ()
-
-    def not_recorded(self) -> tuple[str, ...]:
-        """Returns the files in the folder of the result that are not of the stage's making."""
-        return ()
-
-    def failure(self) -> ReconError | None:
-        """Returns what the user asked for and did not get, though the result is worth keeping."""
-        return None
 
     def to_json(self) -> dict[str, Any]:
         """Returns JSON values that `from_json` reads; tuples become lists."""

@@ -18,7 +18,7 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ import psutil
 from filelock import FileLock, Timeout
 
 from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
-from recon_cli.workspace import disk, durable, journal, manifest
+from recon_cli.workspace import disk, durable, journal, manifest, shared_folder
 from recon_cli.workspace.atomic import LEFTOVERS, clear_leftovers, read_json, sync_folder
 from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import (
@@ -36,6 +36,7 @@ from recon_cli.workspace.manifest import (
     ResultKey,
     describe_progress,
     find_changed_outputs,
+    manifest_name,
 )
 from recon_cli.workspace.paths import is_plain_file
 
@@ -43,7 +44,7 @@ LOG = "recon.log"
 LOCK = ".lock"  # dropped by the system when its holder dies
 HOLDER = ".lock.json"  # beside the lock, because a locked file cannot be read everywhere
 BLOCKS = "blocks"  # workspaces that `recon train --blocks` made before it was one stage
-SEEDS = "seeds"  # workspaces of `recon eval --seeds`, by seed
+SEEDS = "seeds"  # workspaces of other seeds that earlier versions made
 RENDERS = "render"  # folders of `recon render`, whose frames are kept to resume
 _OLD = ".old"  # results that were replaced
 
@@ -63,7 +64,7 @@ class Workspace:
 
     def folder(self, stage: str) -> Path:
         """Returns where a stage's finished result lies or will lie."""
-        return self.root / stage
+        return self.root / stage.partition(".")[0]
 
     def partial(self, stage: str) -> Path:
         """Returns where a stage writes before it is finished."""
@@ -73,7 +74,7 @@ class Workspace:
         return self.root / _OLD / stage
 
     def _record(self, stage: str) -> Path:
-        return self.partial(stage).with_suffix(".json")
+        return self.root / journal.PARTIAL / f"{stage}.json"
 
     @contextmanager
     def writing(self, verb: str) -> Iterator[None]:
@@ -115,8 +116,8 @@ class Workspace:
         Raises:
             ManifestError: there is one that cannot be trusted.
         """
-        folder = self.folder(stage)
-        return Manifest.read(folder) if _has_manifest(folder) else None
+        folder, name = self.folder(stage), manifest_name(stage)
+        return Manifest.read(folder, name) if _has_manifest(folder, name) else None
 
     def partial_run(self, stage: str) -> PartialRun | None:
         """Returns how far an interrupted run of a stage came, or None."""
@@ -179,20 +180,14 @@ class Workspace:
         remove(self.partial(stage))
         remove(journal.journal_path(self.partial(stage)))
 
-    def seal(self, stage: str, *, without: Collection[str] = ()) -> dict[str, FileDigest]:
-        """Flushes a stage's files and returns the digest of each, by relative path.
-
-        Files `without` are in its folder, but not of its making.
-        """
+    def seal(self, stage: str) -> dict[str, FileDigest]:
+        """Flushes a stage's files and returns the digest of each, by relative path."""
         folder = self.partial(stage)
         outputs = {}
         for path in sorted(folder.rglob("*")):
-            name = path.relative_to(folder).as_posix()
-            if name in without:
-                continue
             durable.flush(path)
             if path.is_file():
-                outputs[name] = digest_file(path)
+                outputs[path.relative_to(folder).as_posix()] = digest_file(path)
         return outputs
 
     def commit(self, finished: Manifest) -> None:
@@ -204,9 +199,14 @@ class Workspace:
 
     def _swap(self, stage: str) -> None:
         """Renames the old result away and the new one into place; any prefix can be resumed."""
-        self._retire(stage)
         partial = self.partial(stage)
-        move(partial, self.folder(stage))
+        if shared_folder.is_shared(stage):
+            shared_folder.move_in(partial, self.folder(stage))
+            remove(partial)
+            sync_folder(self.folder(stage))
+        else:
+            self._retire(stage)
+            move(partial, self.folder(stage))
         sync_folder(self.root)
         sync_folder(partial.parent)
         remove(self._record(stage))
@@ -240,7 +240,9 @@ class Workspace:
         for partial in _folders(self.root / journal.PARTIAL):
             if not self._record(partial.name).is_file() or not _complete(partial):
                 continue
-            damage = find_changed_outputs(partial, Manifest.read(partial), ())
+            damage = (shared_folder.find_damage(partial, self.folder(partial.name))
+                      if shared_folder.is_shared(partial.name) else
+                      find_changed_outputs(partial, Manifest.read(partial), ()))
             if damage:
                 logger.warning("%s: work interrupted by a crash was damaged since (%s), and "
                                "is discarded", partial.name, "; ".join(damage))
@@ -258,8 +260,17 @@ class Workspace:
 
     def remove(self, stage: str) -> None:
         """Removes a stage's result; raises WorkspaceError where the folder is none."""
+        if "." in stage:
+            for path in self.result_paths(stage):
+                remove(path)
+            return
         self._retire(stage)
         remove(self._old(stage))
+
+    def result_paths(self, stage: str) -> list[Path]:
+        """Returns what is removed with a stage's result: its folder, or its files in one."""
+        folder = self.folder(stage)
+        return shared_folder.result_paths(folder, stage) if "." in stage else [folder]
 
     def scraps(self) -> list[Path]:
         """Returns files that no finished result needs: unfinished work, old results, blocks, seeds.
@@ -347,13 +358,13 @@ def _is_in_use(leftover: Path) -> bool:
     return number is not None and psutil.pid_exists(int(number[1]))
 
 
-def _has_manifest(folder: Path) -> bool:
+def _has_manifest(folder: Path, name: str = manifest.NAME) -> bool:
     """Returns whether a folder has a manifest, be it a link that leads nowhere.
 
     PermissionError where that cannot be known: a result is not missing for that.
     """
     try:
-        os.lstat(folder / manifest.NAME)
+        os.lstat(folder / name)
     except PermissionError:
         raise
     except (OSError, ValueError):
@@ -364,7 +375,8 @@ def _has_manifest(folder: Path) -> bool:
 def _complete(folder: Path) -> bool:
     """Returns whether a folder holds a manifest that can be trusted: it is written last."""
     try:
-        return _has_manifest(folder) and bool(Manifest.read(folder))
+        name = manifest_name(folder.name)
+        return _has_manifest(folder, name) and bool(Manifest.read(folder, name))
     except ManifestError:
         return False
 

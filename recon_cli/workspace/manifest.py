@@ -12,7 +12,14 @@ from typing import Any
 
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.workspace.atomic import read_json, write_json
-from recon_cli.workspace.digests import FileDigest, Source, digest_file, matches, sha256_json
+from recon_cli.workspace.digests import (
+    FileDigest,
+    Source,
+    digest_file,
+    digest_outputs,
+    matches,
+    sha256_json,
+)
 from recon_cli.workspace.json_record import KEY, JsonRecord
 
 NAME = "manifest.json"
@@ -20,6 +27,12 @@ SCENE = "splats.ply"  # in the results of train and prune
 SCHEMA = 1
 _NAME_BYTES = 255  # the most that file systems take
 _MAX_REASONS = 3  # changes of one kind that are named; the rest is counted
+
+
+def manifest_name(stage: str) -> str:
+    """Returns the name of a manifest: that of `export.spz`, in the folder of export, has it in."""
+    part = stage.partition(".")[2]
+    return f"manifest.{part}.json" if part else NAME
 
 
 @dataclass(frozen=True)
@@ -78,23 +91,30 @@ class Manifest:
     digest: str  # of the outputs that later stages may depend on
     run: RunRecord  # how it came about
 
+    def digest_of(self, patterns: Sequence[str]) -> str:
+        """Returns the digest of the outputs alone whose paths match a pattern."""
+        return digest_outputs({name: file for name, file in self.outputs.items()
+                               if matches(name, patterns)}, ())
+
     def write(self, folder: Path) -> None:
         """Writes the manifest into a stage's folder, whole or not at all."""
         content = {
             "schema": SCHEMA, **self.key.to_json(), "fingerprint": self.key.fingerprint,
             **_Result(self.outputs, self.digest).to_json(), **self.run.to_json()}
-        write_json(folder / NAME, {**content, "self": sha256_json(content)})
+        write_json(folder / manifest_name(self.key.stage), {
+            **content, "self": sha256_json(content)})
 
     @classmethod
-    def read(cls, folder: Path) -> Manifest:
-        """Returns the manifest in a stage's folder.
+    def read(cls, folder: Path, name: str = NAME) -> Manifest:
+        """Returns the manifest in a stage's folder; `name` is that of its file.
 
         Raises:
             ManifestError: it is truncated, was edited, has another schema, or names files that do
                 not lie in the folder.
         """
-        path = folder / NAME
-        clean = shlex.join(["recon", "clean", folder.name, "-w", str(folder.parent)])
+        path = folder / name
+        stage = folder.name + name.removeprefix("manifest").removesuffix(".json")
+        clean = shlex.join(["recon", "clean", stage, "-w", str(folder.parent)])
         hint = f"Remove this result by `{clean}`, then make it again."
         if (folder / SCENE).is_file():
             hint = f"Copy {folder / SCENE}, the scene itself, elsewhere if you need it. {hint}"

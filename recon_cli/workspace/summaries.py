@@ -398,6 +398,43 @@ class EvaluateSummary(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportChange(JsonRecord):
+    """The Gaussians and dB that an option of export removed."""
+
+    option: str
+    gaussians: int
+    gaussians_before: int
+    degree: int  # of the spherical harmonics
+    degree_before: int
+    psnr_change_db: float  # on the views that the export is checked on
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSummary(JsonRecord):
+    """The result of export: a .ply, which the other formats are compared with."""
+
+    model: str  # base or pruned
+    file: str  # name of the .ply
+    gaussians: int
+    bytes: int  # of the .ply
+    transform: Mapping[str, Any]  # similarity from the world of the training to the files
+    changes: tuple[ExportChange, ...] | None = None  # by options, in order
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportedFile(JsonRecord):
+    """A file or folder of another format beside the exported .ply."""
+
+    file: str  # name
+    bytes: int | None = None  # None for a folder of cameras
+    # None, as the next one, for what is not of Gaussians
+    smaller: float | None = None  # size of the .ply over its size
+    psnr_change_db: float | None = None  # on the views that the export is checked on
+    psnr_db: float | None = None  # of the file on them; None where an older version wrote it
+    inferred_share: float | None = None  # of a mesh: share of its area that no view confirms
+
+
+@dataclass(frozen=True, kw_only=True)
 class ImportSummary(JsonRecord):
     """The imported scene, and how well it fits the views of the workspace."""
 

@@ -12,7 +12,7 @@ import click
 import numpy as np
 import torch
 
-from recon_cli.experiments.bench_scene import room
+from recon_cli.experiments.synthetic_room import room
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.render.numba.step import PhotometricStep

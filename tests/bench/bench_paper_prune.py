@@ -23,7 +23,12 @@ from recon_cli.config.stages import ComputeConfig, PruneConfig, RunConfig
 from recon_cli.evaluation.intervals import paired_t
 from recon_cli.evaluation.scores import Table
 from recon_cli.experiments.runner import _prune_run, score_as_ply
-from recon_cli.experiments.scenes import LoadedScene, check_scenes, load_for_training, open_scene
+from recon_cli.experiments.scenes import (
+    ExperimentScene,
+    check_scenes,
+    load_for_training,
+    open_scene,
+)
 from recon_cli.experiments.variants import REFERENCE, MidPrune, TrainingRun
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import NullProgress
@@ -73,7 +78,7 @@ GRID = (
 NONE = "3DGS"
 
 
-def make_runs(loaded: LoadedScene, seed: int, steps: int, wanted: set[str], scratch: Path
+def make_runs(loaded: ExperimentScene, seed: int, steps: int, wanted: set[str], scratch: Path
               ) -> Iterator[dict[str, object]]:
     """Yields the score of 3DGS and of every wanted setting."""
     run = TrainingRun(REFERENCE, loaded.base, steps, seed)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from recon_cli import rasterization
-from recon_cli.experiments.bench_scene import SceneSize, build_scene
+from recon_cli.experiments.synthetic_room import SceneSize, build_scene
 from recon_cli.render.registry import render
 
 

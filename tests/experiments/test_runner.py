@@ -13,10 +13,15 @@ from tiny_scene import make_inputs
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
-from recon_cli.experiments import instruments
-from recon_cli.experiments.instruments import Clock
+from recon_cli.experiments import clock as clocks
+from recon_cli.experiments.clock import Clock
 from recon_cli.experiments.runner import run_trial
-from recon_cli.experiments.scenes import LoadedScene, SceneFolders, check_scenes, load_for_training
+from recon_cli.experiments.scenes import (
+    ExperimentScene,
+    SceneFolders,
+    check_scenes,
+    load_for_training,
+)
 from recon_cli.experiments.variants import BUDGET, PAPER, REFERENCE, TrainingRun
 
 BASE = RunConfig(iterations=1, max_size=48, max_gaussians=90, densify_every=10, validation=0.2)
@@ -27,22 +32,22 @@ def nothing() -> None:
 
 
 @pytest.fixture
-def tiny(tmp_path: Path) -> LoadedScene:
+def tiny(tmp_path: Path) -> ExperimentScene:
     place = SceneFolders("tiny", make_inputs(tmp_path))
     return load_for_training(place, "validation", BASE, StageContext(backend="numba"))
 
 
 def test_the_clock_stands_still_in_its_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     walls, cpus = iter([1.0, 3.0, 10.0, 11.0]), iter([5.0, 9.0, 20.0, 20.5])
-    monkeypatch.setattr(instruments.time, "perf_counter", lambda: next(walls))
-    monkeypatch.setattr(instruments.time, "process_time", lambda: next(cpus))
+    monkeypatch.setattr(clocks.time, "perf_counter", lambda: next(walls))
+    monkeypatch.setattr(clocks.time, "process_time", lambda: next(cpus))
     clock = Clock("cpu")
     with clock.pause():  # from 3 to 10, and from 9 to 20
         pass
     assert clock.seconds() == (3.0, 4.5)
 
 
-def test_looking_changes_nothing_about_a_run(tiny: LoadedScene) -> None:
+def test_looking_changes_nothing_about_a_run(tiny: ExperimentScene) -> None:
     run = TrainingRun(REFERENCE, BASE, 40, 0)
     often = run_trial(tiny, run, range(0, 41, 5), on_step=nothing)
     once = run_trial(tiny, run, (), on_step=nothing)
@@ -55,13 +60,13 @@ def test_looking_changes_nothing_about_a_run(tiny: LoadedScene) -> None:
     assert often[-1].bytes > 248 * often[-1].gaussians  # 62 float32 each, and a header
 
 
-def test_every_step_is_reported_once(tiny: LoadedScene) -> None:
+def test_every_step_is_reported_once(tiny: ExperimentScene) -> None:
     steps: list[int] = []
     run_trial(tiny, TrainingRun(PAPER, BASE, 30, 0), (7,), on_step=lambda: steps.append(1))
     assert len(steps) == 30
 
 
-def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: LoadedScene) -> None:
+def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: ExperimentScene) -> None:
     assert PAPER.prune
     assert (PAPER.prune.config.ratio, PAPER.prune.config.score) == (0.6, "paper")
     points = {one.iteration: one for one in run_trial(
@@ -73,7 +78,7 @@ def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: LoadedScene)
     assert other[0].psnr_db == points[40].psnr_db  # the same run up to there
 
 
-def test_a_run_trains_on_no_view_that_is_scored(tiny: LoadedScene) -> None:
+def test_a_run_trains_on_no_view_that_is_scored(tiny: ExperimentScene) -> None:
     task = tiny.task(TrainingRun(BUDGET, BASE, 5, 0))
     assert len(task.train) == len(tiny.scene.train)
     assert task.validation == []

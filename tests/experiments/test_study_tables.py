@@ -6,7 +6,7 @@ import pytest
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.experiments import study
-from recon_cli.experiments.instruments import Host
+from recon_cli.experiments.clock import Host
 from recon_cli.experiments.paper_tables import TABLE_I, published_scores
 from recon_cli.experiments.runner import CurvePoint, Record, SceneRuns
 from recon_cli.experiments.study import (

@@ -12,7 +12,7 @@ from recon_cli.render import render
 from recon_cli.scene.backdrop import Backdrop, fibonacci_sphere
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.splats import Splats, joined
-from recon_cli.workspace.export_record import ExportChange
+from recon_cli.workspace.summaries import ExportChange
 
 
 def room(*, far: int = 0, backdrop: Backdrop | None = None) -> Splats:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from scenes import camera_at, leaves, random_splats
 
-from recon_cli.experiments.bench_scene import room
+from recon_cli.experiments.synthetic_room import room
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.render.numba import backend

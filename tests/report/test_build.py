@@ -86,7 +86,6 @@ def test_what_is_missing_is_said_in_its_place_with_the_command(workspace):
             ("exports", "export", "export"), ("pruning", "prune", "prune")):
         assert f"{stage} is missing" in section(page, name)
         assert f"<code>recon {command} -w {workspace}</code>" in section(page, name)
-    assert f"recon prune --sweep -w {workspace}" in section(page, "pruning")
     assert "<svg" not in section(page, "training")
     assert STALE not in page
 

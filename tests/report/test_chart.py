@@ -96,18 +96,6 @@ def test_axes_have_labels_with_units_and_a_legend_names_every_series():
         assert text in figure
 
 
-def test_a_second_axis_is_the_first_in_other_units():
-    figure = draw_chart("t", Axis("Gaussians"), Y, [Series("a", ((0, 1), (100, 2)))],
-                   above=("MB", 0.1))
-
-    def place(text, y):
-        match = re.search(rf'x="([\d.]+)" y="{y}" text-anchor="middle">{text}<', figure)
-        assert match, (text, figure)
-        return float(match.group(1))
-
-    assert place("100", "273") == pytest.approx(place("10", "37"), abs=0.2)
-
-
 @pytest.mark.parametrize("shape", MARKS)
 def test_every_mark_is_drawn_around_its_place(shape):
     drawn = draw_mark(shape, 50, 40, 4, 0)

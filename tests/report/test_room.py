@@ -17,7 +17,7 @@ VALUE = {"unit": "m", "ceiling_height": {"value": 2.5, "error": 0.02}, "floor_ar
 def export(tmp_path):
     (tmp_path / "measures.json").write_text(json.dumps(VALUE))
     (tmp_path / "plan.svg").write_text("<svg/>")
-    return SimpleNamespace(there=True, folder=tmp_path, summary={})
+    return SimpleNamespace(there=True, folder=tmp_path, parts=())
 
 
 def test_measures_are_shown_with_their_intervals(export):
@@ -30,9 +30,9 @@ def test_measures_are_shown_with_their_intervals(export):
 
 
 def test_measures_that_were_kept_of_an_earlier_export_are_called_stale(export):
-    export.summary = {"files": {"plan.svg": {"stale": "it was made from earlier cameras"}}}
-    assert read_room(export).notes == (
-        "The plan is stale: it was made from earlier cameras.", "No floor.")
+    export.parts = [SimpleNamespace(
+        name="export.plan.svg", fresh=False, why="sfm's output changed")]
+    assert read_room(export).notes == ("The plan is stale: sfm's output changed.", "No floor.")
 
 
 def test_without_a_plan_there_is_no_room(export):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from foreign import truth
 from tiny_scene import make_inputs
+from tiny_stages import run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import ImportConfig
@@ -15,7 +16,7 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, StageError
 from recon_cli.scene.splats import Splats, joined
 from recon_cli.splats.ply import read_ply, write_ply
-from recon_cli.stages import export, import_scene
+from recon_cli.stages import import_scene
 
 CONTEXT = StageContext(backend="numba")
 
@@ -43,7 +44,7 @@ def given(tmp_path_factory):
 
 
 def exported(given, out, **options):
-    return export.run(ExportConfig(**options), given, out, CONTEXT)
+    return run_export(ExportConfig(**options), given, out, CONTEXT)
 
 
 def test_planted_floaters_go_and_the_views_gain(given, tmp_path, caplog):

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from tiny_stages import CONTEXT
+from tiny_stages import CONTEXT, run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageInputs
@@ -18,7 +18,6 @@ from recon_cli.io.colmap import read_images
 from recon_cli.splats.format import SplatFormat
 from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
 from recon_cli.splats.registry import FORMATS, read_splats
-from recon_cli.stages import export
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, PLAN
 
 ASKED = [name for name in EXPORT_FORMATS if name != PLAN]  # the tiny scene has no scale
@@ -34,7 +33,7 @@ def inputs(tiny_learnt):
 def exported(tiny_learnt, tmp_path_factory):
     """All formats at once: the folder and the summary."""
     out = tmp_path_factory.mktemp("export")
-    return out, export.run(ExportConfig(format=",".join(ASKED)), tiny_learnt, out, CONTEXT)
+    return out, run_export(ExportConfig(format=",".join(ASKED)), tiny_learnt, out, CONTEXT)
 
 
 def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported, inputs):
@@ -83,7 +82,7 @@ def test_an_export_that_was_killed_goes_on_over_what_it_left(exported, inputs, t
     shutil.copytree(whole, out)
     (out / "transforms.json").unlink()
     (out / "sparse" / "0" / "images.bin").unlink()
-    export.run(ExportConfig(format=",".join(ASKED)), inputs, out, CONTEXT)
+    run_export(ExportConfig(format=",".join(ASKED)), inputs, out, CONTEXT)
     before, after = ({path.relative_to(folder): path.read_bytes()
                       for path in folder.rglob("*") if path.is_file()} for folder in (whole, out))
     assert before == after
@@ -97,7 +96,7 @@ def test_points_are_those_of_the_room_not_of_what_its_windows_show(inputs, tmp_p
     splats.means[-5:] *= 1e4
     write_ply(folder / "splats.ply", splats)
     (tmp_path / "out").mkdir()
-    export.run(ExportConfig(format="points.ply"),
+    run_export(ExportConfig(format="points.ply"),
                StageInputs({**inputs.folders, "train": folder}), tmp_path / "out", CONTEXT)
     points, _ = read_ply_points(tmp_path / "out" / "points.ply")
     assert len(points) == len(splats) - 5
@@ -105,7 +104,7 @@ def test_points_are_those_of_the_room_not_of_what_its_windows_show(inputs, tmp_p
 
 def test_what_each_format_loses_is_said(inputs, tmp_path, caplog):
     caplog.set_level(logging.INFO, "recon")
-    export.run(ExportConfig(format="spz"), inputs, tmp_path, CONTEXT)
+    run_export(ExportConfig(format="spz"), inputs, tmp_path, CONTEXT)
     assert any("spz: " in line and "x smaller, " in line and " dB" in line
                for line in caplog.messages)
 
@@ -119,22 +118,16 @@ def test_a_format_that_loses_more_than_it_may_is_refused(inputs, tmp_path, monke
         return scene
 
     monkeypatch.setitem(FORMATS, "spz", SplatFormat(darker, real.write_with))
-    summary = export.run(ExportConfig(format="spz,glb"), inputs, tmp_path, CONTEXT)
-    assert set(summary.files) == {"glb"}
-    assert not (tmp_path / "splats.spz").exists()
-    error = summary.failure()
-    assert isinstance(error, ReconstructionError)
-    assert "may lose 0.3 dB" in error.message
-    assert "Written: splats.ply, splats.glb." in error.message
-    assert "--max-loss" in error.hint
-    summary = export.run(ExportConfig(format="spz", max_loss=100.0), inputs, tmp_path, CONTEXT)
-    assert summary.failure() is None
+    with pytest.raises(ReconstructionError, match=r"may lose 0\.3 dB") as error:
+        run_export(ExportConfig(format="spz"), inputs, tmp_path)
+    assert "--max-loss" in error.value.hint
+    assert run_export(ExportConfig(format="spz", max_loss=100.0), inputs, tmp_path).files
 
 
 def test_a_scene_that_is_measured_is_scored_in_its_new_world(inputs, tmp_path):
     config = ExportConfig(
         format="glb", scale_between=("000000.png", "000006.png", 7.0), backdrop="keep")
-    summary = export.run(config, inputs, tmp_path, CONTEXT)
+    summary = run_export(config, inputs, tmp_path, CONTEXT)
     assert abs(summary.files["glb"].psnr_change_db) < 1e-3
     before = read_ply(inputs.folders["train"] / "splats.ply")
     after = FORMATS["glb"].read(tmp_path / "splats.glb")
@@ -150,8 +143,8 @@ def test_an_unknown_format_is_refused_with_those_that_are_known(text):
 
 
 def test_without_other_formats_nothing_else_is_written(inputs, tmp_path):
-    summary = export.run(ExportConfig(), inputs, tmp_path, CONTEXT)
-    assert summary.files is None
+    summary = run_export(ExportConfig(), inputs, tmp_path, CONTEXT)
+    assert summary.files == {}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["splats.ply", "transform.json"]
     assert torch.equal(read_ply(tmp_path / "splats.ply").means,
                        read_ply(inputs.folders["train"] / "splats.ply").means)
@@ -159,6 +152,6 @@ def test_without_other_formats_nothing_else_is_written(inputs, tmp_path):
 
 def test_a_plan_without_a_scale_is_refused_before_anything_is_written(inputs, tmp_path):
     with pytest.raises(StageError, match="the scale is arbitrary") as error:
-        export.run(ExportConfig(format="mesh.ply,plan.svg"), inputs, tmp_path, CONTEXT)
+        run_export(ExportConfig(format="mesh.ply,plan.svg"), inputs, tmp_path, CONTEXT)
     assert "--scale-between" in error.value.hint
     assert not list(tmp_path.iterdir())

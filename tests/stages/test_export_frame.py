@@ -13,6 +13,7 @@ import summaries
 import torch
 from scenes import random_splats
 from tiny_scene import make_inputs
+from tiny_stages import run_export
 
 from recon_cli.config.export import ExportConfig, read_matrix
 from recon_cli.config.stages import RunConfig
@@ -26,7 +27,6 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
 from recon_cli.splats.registry import read_splats
 from recon_cli.splats.spz import load_spz, unpack
-from recon_cli.stages import export
 from recon_cli.train.train_data import read_config, write_config
 from recon_cli.workspace.atomic import write_json
 
@@ -61,7 +61,7 @@ def up_is_z(inputs):
 def exported(inputs, **options):
     """The folder of an export and its summary."""
     out = inputs.folders["train"].parent / "out"
-    return out, export.run(ExportConfig(**options), inputs, out, StageContext())
+    return out, run_export(ExportConfig(**options), inputs, out, StageContext())
 
 
 def flat(similarity):

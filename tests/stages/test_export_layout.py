@@ -15,11 +15,10 @@ import pycolmap
 import pytest
 import trimesh
 from PIL import Image
-from tiny_stages import CONTEXT
+from tiny_stages import CONTEXT, run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.io.colmap import read_images, read_points
-from recon_cli.stages import export
 
 pytestmark = pytest.mark.integration
 
@@ -28,7 +27,7 @@ pytestmark = pytest.mark.integration
 def out(tiny_learnt, tmp_path_factory):
     """An export with cameras, turned, so that a frame that is mixed up shows."""
     folder = tmp_path_factory.mktemp("export")
-    export.run(ExportConfig(format="colmap,transforms.json", up="y"), tiny_learnt, folder, CONTEXT)
+    run_export(ExportConfig(format="colmap,transforms.json", up="y"), tiny_learnt, folder, CONTEXT)
     return folder
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_stages import CONTEXT, LEARNT
+from tiny_stages import CONTEXT, LEARNT, run_export
 
 from recon_cli.cli import main
 from recon_cli.config.export import ExportConfig
@@ -20,7 +20,6 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.splats.registry import FORMATS
-from recon_cli.stages import export
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.records import ImportRecord
 
@@ -38,7 +37,7 @@ def whole(inputs):
 
 
 def exported(inputs, out, **options):
-    return export.run(ExportConfig(**options), inputs, out, CONTEXT)
+    return run_export(ExportConfig(**options), inputs, out, CONTEXT)
 
 
 def test_a_crop_keeps_the_centres_in_the_box_and_says_what_went(inputs, whole, tmp_path, caplog):

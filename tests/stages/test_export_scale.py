@@ -9,6 +9,7 @@ import pytest
 import torch
 from scenes import random_splats
 from tiny_scene import make_inputs
+from tiny_stages import run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import RunConfig
@@ -21,7 +22,6 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.align_world import world_transform
 from recon_cli.splats.ply import read_ply, write_ply
-from recon_cli.stages import export
 from recon_cli.train.train_data import write_config
 
 
@@ -40,7 +40,7 @@ def test_a_measured_scene_is_larger_and_looks_the_same(inputs, tmp_path):
     # Frames 0 and 6 of the tiny scene: (0.4, 0, 0) and 0.4 (cos 6, sin 6), 0.6, seen from outside.
     apart = np.linalg.norm([0.4 - 0.4 * np.cos(6), -0.4 * np.sin(6), -0.6])
     config = ExportConfig(scale_between=("000000.png", "000006.png", float(3 * apart)))
-    summary = export.run(config, inputs, tmp_path / "out", StageContext())
+    summary = run_export(config, inputs, tmp_path / "out", StageContext())
     before = read_ply(tmp_path / "train" / "splats.ply")
     after = read_ply(tmp_path / "out" / "splats.ply")
     assert torch.allclose(after.means, 3 * before.means, rtol=1e-6)
@@ -58,7 +58,7 @@ def test_a_measured_scene_is_larger_and_looks_the_same(inputs, tmp_path):
 
 def test_the_transform_is_recorded_with_what_was_measured(inputs, tmp_path):
     config = ExportConfig(scale_between=("000000.png", "5,5,5", 2.0))
-    export.run(config, inputs, tmp_path / "out", StageContext())
+    run_export(config, inputs, tmp_path / "out", StageContext())
     record = json.loads((tmp_path / "out" / "transform.json").read_text())
     ends = np.array([record["measurement"]["a_xyz"], record["measurement"]["b_xyz"]])
     assert record["similarity"]["scale"] * np.linalg.norm(ends[0] - ends[1]) == pytest.approx(2.0)
@@ -66,7 +66,7 @@ def test_the_transform_is_recorded_with_what_was_measured(inputs, tmp_path):
 
 
 def test_an_export_that_measures_nothing_says_that_nothing_was_moved(inputs, tmp_path):
-    summary = export.run(ExportConfig(), inputs, tmp_path / "out", StageContext())
+    summary = run_export(ExportConfig(), inputs, tmp_path / "out", StageContext())
     record = json.loads((tmp_path / "out" / "transform.json").read_text())
     assert Similarity.from_json(record["similarity"]).is_identity
     assert summary.transform == record["similarity"]
@@ -78,7 +78,7 @@ def test_an_export_that_measures_nothing_says_that_nothing_was_moved(inputs, tmp
 def test_a_frame_without_a_camera_stops_the_export_before_it_writes(inputs, tmp_path):
     config = ExportConfig(scale_between=("000099.png", "000006.png", 1.0))
     with pytest.raises(ConfigError, match=r"000009\.png"):
-        export.run(config, inputs, tmp_path / "out", StageContext())
+        run_export(config, inputs, tmp_path / "out", StageContext())
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -113,7 +113,7 @@ def test_what_sfm_knew_and_what_is_measured_later_give_one_scale(inputs, tmp_pat
     weights = np.array([error, 0.01])**-2.0
     assert np.log(frame.fused.scale) == pytest.approx(np.log(1.01) * weights[0] / weights.sum())
     assert find_room_frame(inputs, frame).scale_error == pytest.approx(weights.sum()**-0.5)
-    export.run(measured(1.01 * APART), inputs, tmp_path / "out", StageContext())
+    run_export(measured(1.01 * APART), inputs, tmp_path / "out", StageContext())
     record = json.loads((tmp_path / "out" / "transform.json").read_text())
     assert record["scale"]["error"] == pytest.approx(weights.sum()**-0.5)
     assert [one["name"] for one in record["scale"]["used"]] == [
@@ -130,7 +130,7 @@ def test_a_length_that_contradicts_what_sfm_knew_decides_and_both_are_named(
         def notice(self, text):
             told.append(text)
 
-    export.run(measured(1.5 * APART), inputs, tmp_path / "out", Context())
+    run_export(measured(1.5 * APART), inputs, tmp_path / "out", Context())
     record = json.loads((tmp_path / "out" / "transform.json").read_text())
     assert record["similarity"]["scale"] == pytest.approx(1.5)
     assert any("The scale by sensor depth is 33.3% smaller than by --scale-between" in text

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tiny_stages import CONTEXT
+from tiny_stages import CONTEXT, run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.errors import StageError
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.ply_tables import read_header, read_tables
-from recon_cli.stages import export
 from recon_cli.trust.ply_property import PLY_PROPERTY, match_rows
 from recon_cli.workspace.records import ImportRecord
 
@@ -24,7 +23,7 @@ def inputs(tiny_learnt):
 
 def exported(inputs, out, **options):
     out.mkdir()
-    export.run(ExportConfig(**options), inputs, out, CONTEXT)
+    run_export(ExportConfig(**options), inputs, out, CONTEXT)
     return read_tables(read_header(out / "splats.ply"))["vertex"]
 
 

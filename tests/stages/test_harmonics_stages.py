@@ -7,6 +7,7 @@ import torch
 from safetensors.torch import load_file
 from scenes import random_splats, with_harmonics
 from tiny_scene import make_inputs
+from tiny_stages import run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import EvaluateConfig, PruneConfig, TrainConfig
@@ -95,7 +96,7 @@ def test_an_export_of_any_degree_and_share_is_read_back(tmp_path, degree, colore
     (tmp_path / "out").mkdir()
     write_ply(tmp_path / "train" / "splats.ply", splats)
     inputs = StageInputs({**inputs.folders, "train": tmp_path / "train"})
-    summary = export.run(ExportConfig(backdrop="keep"), inputs, tmp_path / "out", CONTEXT)
+    summary = run_export(ExportConfig(backdrop="keep"), inputs, tmp_path / "out", CONTEXT)
     assert summary.gaussians == 30
     verify.verify_ply(tmp_path / "out" / "splats.ply", splats)
     write_ply(tmp_path / "out" / "splats.ply", with_harmonics(splats, degree, 0))

@@ -12,6 +12,7 @@ import torch
 from foreign import truth
 from scenes import random_splats
 from tiny_scene import make_inputs
+from tiny_stages import run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import ImportConfig, PruneConfig
@@ -25,7 +26,7 @@ from recon_cli.splats.glb import write_glb
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.splats.registry import FORMATS, load_splats
 from recon_cli.splats.spz import write_spz
-from recon_cli.stages import evaluate, export, import_scene, prune
+from recon_cli.stages import evaluate, import_scene, prune
 from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
@@ -277,7 +278,7 @@ def test_what_was_trained_with_antialiasing_is_recorded_said_and_exported(tmp_pa
     assert ImportRecord.read(tmp_path / "train").antialiased
     config = ExportConfig(format="spz,sog,ply", max_loss=30)
     (tmp_path / "export").mkdir()
-    export.run(config, StageInputs({"train": tmp_path / "train"}), tmp_path / "export", CONTEXT)
+    run_export(config, StageInputs({"train": tmp_path / "train"}), tmp_path / "export", CONTEXT)
     for name in config.formats:
         assert load_splats(tmp_path / "export" / f"splats.{name}").antialiased, name
 
@@ -286,7 +287,7 @@ def test_a_scene_that_was_moved_is_exported_with_the_point_it_was_moved_from(tmp
     brought_in(far_away(tmp_path / "a.ply", [448262.25, 5411932.5, 301.5]), None,
                tmp_path / "train")
     (tmp_path / "export").mkdir()
-    export.run(ExportConfig(), StageInputs({"train": tmp_path / "train"}), tmp_path / "export",
+    run_export(ExportConfig(), StageInputs({"train": tmp_path / "train"}), tmp_path / "export",
                CONTEXT)
     record = json.loads((tmp_path / "export" / "transform.json").read_text())
     assert record["origin"] == in_record(tmp_path / "train")["origin"]

@@ -72,8 +72,6 @@ def test_training_it_further_goes_on_and_nothing_else_replaces_it(workspace, cap
         assert recon("train", workspace, *words) == 4
         assert "imported from room.ply, trained further" in capsys.readouterr().err
     assert (workspace / "train" / "splats.ply").read_bytes() == before
-    assert recon("eval", workspace, "--seeds", "2") == 4
-    assert "with another seed" in capsys.readouterr().err
     assert recon("train", workspace, "--iterations", "200", *FURTHER[3:]) == 0
     assert (summary(workspace)["imported_from"], summary(workspace)["continued_from_step"]) == (
         "room.ply", 120)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from tiny_scene import make_inputs
 
+from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import PruneConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.io.images import read_image
-from recon_cli.stages import prune, train
+from recon_cli.stages import export, prune, train
 
 CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05,
@@ -63,3 +67,15 @@ def mean_colour_psnr(inputs):
     image = read_image(inputs.folders["sfm"] / "undistorted" / "images" / "000006.png", 48, 36)
     mean = np.broadcast_to(image.mean((0, 1)) / 255, image.shape).astype(np.float32)
     return psnr(mean, image)
+
+
+def run_export(
+    config: ExportConfig, inputs: StageInputs, out: Path, ctx: StageContext = CONTEXT
+) -> SimpleNamespace:
+    """Exports the .ply and its other formats to one folder; their records are `files`."""
+    ctx = replace(ctx, shared={})
+    summary = export.run(config, inputs, out, ctx)
+    folders = {**inputs.folders, "export": out}
+    return SimpleNamespace(**vars(summary), files={
+        name: export.run(config, replace(inputs, folders=folders, part=name), out, ctx)
+        for name in config.parts})
