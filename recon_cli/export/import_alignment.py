@@ -26,7 +26,7 @@ from recon_cli.workspace.summaries import WorldSummary
 SOURCE, WORKSPACE = "source", "workspace"
 _VIEWS = 6  # rendered in each frame, at most
 # dB above flat pictures: three scenes got 15 to 24 in place, 2.5 to 9 if turned by 3 degrees or a
-# tenth too large, and less than 2 if further off. docs/import.md
+# tenth too large, and less than 2 if further off. tests/bench/bench_import_frames.py
 _DOUBTFUL, _EVIDENT = 8.0, 2.0
 
 

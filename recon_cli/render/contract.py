@@ -1,4 +1,4 @@
-"""The contract of every rasterizer; its equations are in docs/rasterizer.
+"""The contract of every rasterizer; its equations are in docs/rasterization.
 
 A backend is a function of the type `Renderer`. It culls tightly (a Gaussian meets a pixel where
 q <= 2 ln(255 o)), clamps alpha at .99, composites front to back in order of depth (ties in order

@@ -12,7 +12,7 @@ import numpy as np
 from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd_functions import fetch_add
 
-# Chosen on the room "living" and checked on "office" (docs/mesh.md); all are flat around:
+# Chosen on the room "living" and checked on "office"; all are flat around:
 _NOISE = np.float32(2.0)  # squared grey levels added to variances: blank windows correlate little
 _MOST_DIFFERENCE = np.float32(4.0)  # grey levels from which on two pixels differ altogether
 _LEAST_SCORE = np.float32(-0.4)  # of a window and another view's; what hides a surface counts so

@@ -1,10 +1,10 @@
 """The quality of a scene in a word with its reason, for people who know no decibels.
 
 The bounds come from tables of docs/benchmarks.md. "Quality in given minutes": the scenes there,
-which look right, have 28.08 dB / .901 or more. "Frames and noise": noise of 20 of 255, which nobody
-overlooks, leaves 22.3 dB. "Cameras": of captures in one part 97% of the frames or more have a
-camera. docs/trust.md: of the surface of living's room 96% is well seen; a tenth that is not is a
-judgement, as there is no table of such scenes.
+which look right, have 28.08 dB / .901 or more. "Cameras": of captures in one part 97% of the frames
+or more have a camera. "Noise" in tests/bench/notes/figures.md: noise of 20 of 255, which nobody
+overlooks, leaves 22.3 dB. docs/trust.md: of the surface of living's room 96% is well seen; a tenth
+that is not is a judgement, as there is no table of such scenes.
 """
 
 from __future__ import annotations

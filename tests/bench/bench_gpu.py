@@ -2,7 +2,7 @@
 
 Builds the kernels, checks them, and measures pictures, gradients, training steps and memory. Each
 figure is printed at once; a table of all of them comes last. Exit code 1 where a check failed or a
-part broke off. docs/bench.md says how things are measured.
+part broke off. tests/bench/README.md says how things are measured.
 
     TRITON_INTERPRET=1 python tests/bench/bench_gpu.py --device cpu --gaussians 60 --size 32x16 \
         --rounds 1 --stretch 2

@@ -1,4 +1,4 @@
-"""Hard cases of compositing: opaque layers, thresholds, ties, long lists. See docs/numerics."""
+"""Hard cases of compositing: opaque layers, thresholds, ties, long lists. See notes/numerics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hard cases of the projection: near plane, grazing angles, needles, quaternions. docs/numerics."""
+"""Hard cases of projection: near plane, grazing angles, needles, quaternions: notes/numerics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values that are not finite, huge coefficients, and colours below black. See docs/numerics."""
+"""Values that are not finite, huge coefficients, and colours below black. See notes/numerics."""
 
 from __future__ import annotations
 
