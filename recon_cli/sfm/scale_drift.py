@@ -40,7 +40,11 @@ SHARED_ERRORS = 10.0
 MAX_SCALE_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_scale_breaks.py`
 # Up to here a scale that nothing contradicts is an interval that is said, and no reason to cut.
 MAX_SCALE_INTERVAL = 0.15
-MIN_SURE_EXPLAINED = 0.85  # share of the matches across that the cameras must explain for that
+# It is contradicted where the cameras explain less than this share of the matches across it (wrong
+# photos far apart .63 to .79, right ones .86 and more), and where the floor says that it is more
+# likely off by 10% than by what is fine.
+MIN_SURE_EXPLAINED = 0.85
+MAX_FLOOR_STEP = (MAX_SCALE_ERROR + 0.1) / 2
 DOUBTFUL = MAX_SCALE_ERROR / 3  # the floor is looked at from here on
 _RIDGE = 1e-10  # times the diagonal: position, turn and scale of the model are free
 POSE = 6  # unknowns of a camera: its turn, and its centre
@@ -71,7 +75,7 @@ class ScaleCut(JsonRecord):
     @property
     def is_contradicted(self) -> bool:
         """Whether heights or matches speak against the relative scale that the model has."""
-        return self.off > MAX_SCALE_ERROR or self.explained < MIN_SURE_EXPLAINED
+        return self.off > MAX_FLOOR_STEP or self.explained < MIN_SURE_EXPLAINED
 
 
 def find_weakest_scale(
@@ -125,7 +129,7 @@ def describe_scale(cut: ScaleCut) -> str:
         return f"{text}, so that lengths on both sides may differ by as much."
     if cut.error > MAX_SCALE_INTERVAL:
         why = "the two sides share too few points that show depth"
-    elif cut.off > MAX_SCALE_ERROR:
+    elif cut.off > MAX_FLOOR_STEP:
         why = f"by the heights above the floor it is off by {cut.off:.0%}"
     else:
         why = (f"the cameras explain {cut.explained:.0%} of the matches across it, and for less "

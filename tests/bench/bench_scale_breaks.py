@@ -43,6 +43,7 @@ from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import build_posed_model, drop_outliers
 from recon_cli.sfm.scale_drift import (
+    MAX_FLOOR_STEP,
     MAX_SCALE_ERROR,
     MAX_SCALE_INTERVAL,
     MIN_SURE_EXPLAINED,
@@ -103,7 +104,7 @@ class Row:
         if self.label == "drift":
             return self.trusted and self.left > SIGMAS * max(self.drift, self.error)
         known = self.error <= MAX_SCALE_ERROR or (
-            self.error <= MAX_SCALE_INTERVAL and self.off <= MAX_SCALE_ERROR
+            self.error <= MAX_SCALE_INTERVAL and self.off <= MAX_FLOOR_STEP
             and self.explained >= explained)
         refused = self.otherwise or self.loops > 0 or not known
         return {"good": refused and self.error <= MAX_SCALE_INTERVAL,
