@@ -50,8 +50,11 @@ def estimate_camera_errors(model: pycolmap.Reconstruction, names: Sequence[str])
     rows = POSE * np.arange(len(names))[:, None] + np.arange(3, POSE)
     changes[rows.ravel()] = across
     spread = np.einsum("uc,uc->c", changes, factor.solve(changes)).reshape(-1, 3).sum(axis=1)
-    deviation = SHARED_ERRORS * np.sqrt(
-        max(variance, LEAST_ERROR_PX**2) * np.maximum(spread, 0.0))
+    # Few observations may fit too well: what they miss counts as the usual error, which weighs as
+    # many of them as the cameras have unknowns.
+    unknowns, free = len(changes), max(2 * len(seen.image) - len(changes) - 3 * seen.points, 0)
+    variance = (unknowns * LEAST_ERROR_PX**2 + free * variance) / (unknowns + free)
+    deviation = SHARED_ERRORS * np.sqrt(variance * np.maximum(spread, 0.0))
     extent = max(float(np.linalg.norm(np.ptp(seen.centers, axis=0))), 1e-300)
     return dict(zip(names, np.minimum(deviation / extent, 1.0).tolist(), strict=True))
 
