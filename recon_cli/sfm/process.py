@@ -160,11 +160,14 @@ def run_job(
 
 @contextmanager
 def _start(job: MappingJob, file: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Yields the running process and kills it on leaving, however that happens."""
-    threads = str(job.threads)
+    """Yields the running process and kills it on leaving, however that happens.
+
+    What several threads share is shared out in here: sums that BLAS or OpenMP split among threads
+    differ with their number.
+    """
     with (job.out / LOG).open("ab") as log, start_module(
         "recon_cli.sfm.worker", str(file), folder=job.out, out=subprocess.PIPE, errors=log,
-        OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads,
+        OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1",
     ) as child:
         try:
             yield child
