@@ -28,7 +28,12 @@ from recon_cli.capture.mask_files import mask_folders
 from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
 from recon_cli.capture.panorama_masks import hide_carried
 from recon_cli.capture.panoramas import fill_sphere
-from recon_cli.capture.photo_sequence import PhotoSequence, find_odd, find_sequence
+from recon_cli.capture.photo_sequence import (
+    PhotoSequence,
+    find_odd,
+    find_sequence,
+    is_dense,
+)
 from recon_cli.capture.photo_tree import find_photo_files
 from recon_cli.capture.photos import (
     PhotoFolder,
@@ -229,8 +234,10 @@ def _choose_followed(
     config: IngestConfig, source: _PhotoSource, sequence: PhotoSequence, ctx: IngestContext
 ) -> tuple[dict[int, FrameCandidate], Tracks]:
     """Returns the decisions on the photos of a sequence, by place, and the tracks through them."""
+    dense = is_dense([source.photos[place] for place in sequence.places])
     count = config.frames or frame_selection.automatic_count(
-        frame_selection.path_length(sequence.scan.motion), most=config.max_frames, least=MIN_KEPT)
+        frame_selection.path_length(sequence.scan.motion), most=config.max_frames,
+        least=MIN_KEPT if dense else len(sequence.places))
     video = judge(config, source.path, sequence.scan, ctx, least=count)
     chosen = frame_selection.choose_frames(
         video.lengths, video.scan.sharpness, video.distinct, count,

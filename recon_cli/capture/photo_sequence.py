@@ -45,9 +45,10 @@ CAMERA_FOLLOWED = 0.8
 # Photos in a row that may belong to another scene; more are a walk of their own.
 MOST_ASTRAY = 3
 FEW_SHARE = 0.1  # of the photos: at most so many are looked at as out of place
-# Time from one photo to the next: the median over a few photos, as EXIF and many names count whole
-# seconds.
-MAX_SECONDS, SPAN = 1.0, 5
+# Time from one photo to the next, of a walk and of one so dense that photos can be spared: bursts
+# take three a second and more, interval timers and drones at most two. It is the median over many
+# photos, as EXIF and many names count whole seconds.
+MAX_SECONDS, DENSE_SECONDS, SPAN = 1.0, 0.4, 20
 _NUMBER = re.compile(r"\d+")
 # Names that cameras give to single photos (JEITA CP-3461, DCF): four characters and a number.
 _CAMERA_NAME = re.compile(r"(?=.{0,3}[A-Z_])[A-Z0-9_]{4}\d{4}")
@@ -134,6 +135,12 @@ def list_runs(photos: Sequence[Photo]) -> list[list[int]]:
             runs.setdefault((home, pattern, camera[photo.name]), []).append(place)
     return [run for run in runs.values() if len(run) > MIN_AUTOMATIC and (
         _usual_seconds([photos[place] for place in run]) or 0) <= MAX_SECONDS]
+
+
+def is_dense(photos: Sequence[Photo]) -> bool:
+    """Returns whether photos that follow each other may have been taken fast enough to spare some.
+    """
+    return (_usual_seconds(photos) or 0) <= DENSE_SECONDS
 
 
 def _usual_seconds(photos: Sequence[Photo]) -> float | None:

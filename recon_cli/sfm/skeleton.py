@@ -96,6 +96,18 @@ def near_pairs(job: MappingJob, reach: int, among: Collection[str] | None = None
             for step in range(1, reach + 1) for pair in zip(names, names[step:], strict=False)}
 
 
+class _Counts(Reporter):
+    """Passes to another reporter how many units are done, while it is shown, and nothing else."""
+
+    def __init__(self, report: Reporter, *, shown: bool = True) -> None:
+        super().__init__(io.BytesIO())
+        self._report, self.shown = report, shown
+
+    def done(self, count: int) -> None:
+        if self.shown:
+            self._report.done(count)
+
+
 @contextmanager
 def build_beside(job: MappingJob, report: Reporter) -> Iterator[None]:
     """Builds the skeleton in a thread while something else is done, as it needs no features.
@@ -106,10 +118,12 @@ def build_beside(job: MappingJob, report: Reporter) -> Iterator[None]:
         # The database is about to be filled.
         images = fresh_folder(job.attempts / f"{SKELETON}.partial") / "images.db"
         shutil.copyfile(job.database, images)
-        building = pool.submit(load_skeleton, job, Reporter(io.BytesIO()), images)
+        counts = _Counts(report, shown=False)
+        building = pool.submit(load_skeleton, job, counts, images)
         yield
         if not building.done():
-            report.phase("skeleton", len(job.names))
+            report.phase("skeleton", len(list_keyframes(job)))
+            counts.shown = True
         building.result()
 
 
@@ -121,14 +135,14 @@ def load_skeleton(
     `images` is the database with the images, if not that of the job.
     """
     def build() -> list[pycolmap.Reconstruction]:
-        report.phase("skeleton", len(job.names))
+        report.phase("skeleton", len(list_keyframes(job)))
         if images is not None:
-            return build_skeleton(job, images)
+            return build_skeleton(job, images, report)
         # Pairs that were matched would count against the model, but not where it is built first.
         copy = fresh_folder(job.attempts / f"{SKELETON}.partial") / "images.db"
         shutil.copyfile(replace(job, matches_db=None).database, copy)
         database.clear_matches(copy)
-        return build_skeleton(job, copy)
+        return build_skeleton(job, copy, report)
 
     return _load_models(job, SKELETON, build)
 
@@ -193,7 +207,7 @@ def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Re
         pairs = matching.near_or_similar_pairs(job, job.names)
     matching.match_pairs(coarse, pairs, report, phase="coarse")
     report.phase("first", len(job.names))
-    models = mapper.map_incrementally(coarse, Reporter(io.BytesIO()))
+    models = mapper.map_incrementally(coarse, _Counts(report))
     shutil.rmtree(folder)
     return sorted(models, key=mapper.model_size, reverse=True)
 
@@ -216,9 +230,11 @@ def copy_coarsest(source: Path, target: Path) -> None:
                 pycolmap.FeatureExtractorType.SIFT, np.asarray(rows.data)[:COARSEST]))
 
 
-def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstruction]:
+def build_skeleton(
+    job: MappingJob, images: Path, report: Reporter
+) -> list[pycolmap.Reconstruction]:
     """Returns the models that tracks alone give, the largest first; a database has the images."""
-    silent = Reporter(io.BytesIO())
+    counts = _Counts(report)
     folder = fresh_folder(job.attempts / f"{SKELETON}.mapping")
     own = replace(job, matches_db=folder / MATCHES_DB)
     tracks = _read_tracks(job)
@@ -226,7 +242,7 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
     tracks = tracks.select({row: tracks.names[row] for row in keyframes})
     rows = range(len(keyframes))
     write_usable_matches(own, images, {}, tracks, rows)
-    models = mapper.map_incrementally(own, silent)
+    models = mapper.map_incrementally(own, counts)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
     # without parallax. What tracks of a long video leave apart is left to the matches.
     whole = len(keyframes) == len(job.names)
@@ -234,7 +250,7 @@ def build_skeleton(job: MappingJob, images: Path) -> list[pycolmap.Reconstructio
         if _most(models) >= ENOUGH_FRAMES * len(keyframes):
             break
         write_usable_matches(own, images, {}, tracks, rows, steps=ALL_TRACK_STEPS)
-        models = max(models, find_models(own, silent), key=_most)
+        models = max(models, find_models(own, counts), key=_most)
     shutil.rmtree(folder)
     models.sort(key=mapper.model_size, reverse=True)
     return models

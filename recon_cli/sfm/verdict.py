@@ -26,9 +26,8 @@ from recon_cli.sfm.lens_trial import BetterLens, find_better_lenses
 from recon_cli.sfm.limits import FEW_KEYPOINTS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
 from recon_cli.sfm.open_loops import OpenLoop, find_open_loops
 from recon_cli.sfm.scale_drift import (
-    MAX_SCALE_ERROR,
     ScaleCut,
-    find_hinge,
+    describe_scale,
     find_weakest_scale,
     is_scale_known,
 )
@@ -104,7 +103,7 @@ class ModelVerdict(JsonRecord):
     points: Histogram  # of the model that each camera sees
     neighbours: Histogram  # of each camera, those with which it shares MIN_POSE_INLIERS points
     still: float  # share of the points in three or more images that do not move in them
-    # Of a walk: where the relative scale of both sides is known least, between the stretches of an
+    # Where the relative scale of both sides is known least, of a walk between the stretches of an
     # open loop where there is one; None where nothing tells.
     scale: ScaleCut | None
     open_loops: tuple[OpenLoop, ...]  # the one that most points show first
@@ -146,8 +145,7 @@ class ModelVerdict(JsonRecord):
             yield (f"Least overlap: two groups of cameras see {aliasing.share:.0%} as much of the "
                    "surfaces that they should share as cameras within one group do.")
         if self.scale is not None:
-            yield ("Scale: the two parts of the walk, before and after any frame, are known to "
-                   f"{self.scale.error:.1%} or better relative to each other.")
+            yield describe_scale(self.scale)
 
     def to_json(self) -> dict[str, Any]:
         """Returns JSON values: the fields, and whether the model is trusted."""
@@ -197,22 +195,10 @@ def examine(
 def _find_drift(
     model: pycolmap.Reconstruction, evidence: MatchEvidence, order: NDArray[np.int64] | None
 ) -> tuple[tuple[OpenLoop, ...], ScaleCut | None]:
-    """Returns the loops of a walk that are open, and the cut where its scale is known least.
-
-    Of panoramas also that where one of them is a hinge, in any order.
-    """
-    hinge = None
-    if any(map(is_panorama, model.cameras.values())):
-        rows = np.flatnonzero(evidence.registered & (evidence.points > 0))
-        hinge = find_hinge(
-            model, [evidence.names[row] for row in rows], evidence.shared[np.ix_(rows, rows)])
-    if order is None:
-        return (), hinge
-    loops = find_open_loops(evidence, order)
-    walk = [evidence.names[row] for row in order if evidence.points[row]]
+    """Returns the loops of a walk that are open, and the cut where the scale is known least."""
+    loops = () if order is None else find_open_loops(evidence, order)
     ends = (loops[0].first, loops[0].second) if loops else None
-    cuts = [cut for cut in (find_weakest_scale(model, walk, between=ends), hinge) if cut]
-    return loops, max(cuts, key=lambda cut: cut.error, default=None)
+    return loops, find_weakest_scale(model, evidence, order, between=ends)
 
 
 def has_drifted(verdict: ModelVerdict) -> bool:
@@ -289,13 +275,7 @@ def _describe_drift(loops: Sequence[OpenLoop], cut: ScaleCut | None) -> list[str
             "images match), but the model contains it twice, with scales "
             f"{abs(loop.scale - 1):.0%} apart and turned by {loop.turn_deg:.0f} degrees: the "
             f"cameras drifted, most likely{where or ' in between'}."]
-    if cut is None or is_scale_known(cut):
-        return []
-    return [
-        f"The scale of {format_count(len(cut.sides[0]), 'camera')} on one side of the cut{where} "
-        f"relative to the {format_count(len(cut.sides[1]), 'other')} is known to {cut.error:.0%} "
-        f"only, but {MAX_SCALE_ERROR:.0%} is needed: the two sides share too few points that show "
-        "depth."]
+    return [] if cut is None or is_scale_known(cut) else [describe_scale(cut)]
 
 
 def _describe_still(share: float) -> list[str]:

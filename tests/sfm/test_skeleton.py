@@ -1,6 +1,7 @@
 """A skeleton from tracks, and which pairs of frames agree with it."""
 
 import io
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,16 +12,18 @@ from made_model import HEIGHT, WIDTH, MadeModel, along, moved, wall
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm import database, matching, skeleton
 from recon_cli.sfm.evidence import gather_evidence
-from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
+from recon_cli.sfm.job import CameraGroup, MappingJob, Phase, Reporter, parse
 from recon_cli.sfm.matching import read_verified
 from recon_cli.sfm.pair_checks import check_pairs, list_models
 from recon_cli.sfm.skeleton import (
+    build_beside,
     build_skeleton,
     choose_coarse_pairs,
     complete_coarse,
     complete_tracked,
     copy_coarsest,
     is_continuous,
+    list_keyframes,
     near_pairs,
     write_usable_matches,
 )
@@ -272,9 +275,25 @@ def repeated(tmp_path):
     return alike, make_job(tmp_path, alike, make_tracks(alike))
 
 
+def test_cameras_from_tracks_are_counted_whether_built_first_or_beside_features(tmp_path):
+    job = make_job(tmp_path, walk(), make_tracks(walk()))
+    stream = io.BytesIO()
+    skeleton.load_skeleton(job, Reporter(stream))
+    shutil.rmtree(job.attempts)
+    alone = [parse(line) for line in stream.getvalue().splitlines()]
+    assert [event for event in alone if isinstance(event, Phase)] == [
+        Phase("skeleton", len(list_keyframes(job)), 0)]
+    assert max(event for event in alone if isinstance(event, int)) == len(list_keyframes(job))
+    stream = io.BytesIO()
+    with build_beside(job, Reporter(stream)):
+        assert not stream.getvalue()
+    for line in stream.getvalue().splitlines():
+        assert isinstance(parse(line), Phase | int)
+
+
 def test_tracks_place_what_looks_alike_where_it_is(repeated):
     made, job = repeated
-    models = build_skeleton(job, job.database)
+    models = build_skeleton(job, job.database, SILENT)
     assert [model.num_reg_images() for model in models] == [24]
     assert errors(models[0], made).max() < 0.2
     checked = check_pairs(job.database, list_models(models), read_verified(job.database))
@@ -288,7 +307,7 @@ def test_tracks_place_what_looks_alike_where_it_is(repeated):
 def test_a_model_is_completed_without_what_only_looks_alike(repeated):
     made, job = repeated
     (folder := job.attempts / skeleton.SKELETON / "0").mkdir(parents=True)
-    build_skeleton(job, job.database)[0].write(folder)
+    build_skeleton(job, job.database, SILENT)[0].write(folder)
     models = complete_tracked(linked(job), SILENT)
     assert [model.num_reg_images() for model in models] == [24]
     assert errors(models[0], made).max() < 0.02
@@ -299,7 +318,7 @@ def test_models_that_tracks_leave_apart_are_joined_by_matches(tmp_path):
     made = walk()
     tracks = make_tracks(made, breaks=[8])
     job = make_job(tmp_path, made, tracks)
-    models = build_skeleton(job, job.database)
+    models = build_skeleton(job, job.database, SILENT)
     assert sorted(model.num_reg_images() for model in models) == [8, 8]
     for index, model in enumerate(models):
         (job.attempts / skeleton.SKELETON / str(index)).mkdir(parents=True)

@@ -23,7 +23,7 @@ from recon_cli.capture import from_photos, from_video
 from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io import images
-from recon_cli.io.tracks import Tracks
+from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.stages import ingest
 
 
@@ -227,6 +227,19 @@ def test_no_metadata_is_carried_over_and_the_focal_length_is_scaled(tmp_path):
     for path in (tmp_path / "out" / "frames").iterdir():
         assert b"Secret" not in path.read_bytes()
         assert not Image.open(path).getexif()
+
+
+
+@pytest.mark.parametrize(("milliseconds", "count"), [(100, 100), (500, 110)])
+def test_photos_of_a_walk_that_were_taken_two_a_second_are_all_kept(
+        tmp_path, milliseconds, count):
+    folder = write_sequence(tmp_path / "room", 110)
+    for index, path in enumerate(sorted(folder.iterdir())):
+        seconds, part = divmod(milliseconds * index, 1000)
+        path.rename(folder / f"20240212_1000{seconds:02d}_{part:03d}.jpg")
+    take(folder, tmp_path / "out")
+    assert len(listed(tmp_path / "out")["frames"]) == count
+    assert (tmp_path / "out" / TRACKS).exists()
 
 # Crashes
 
