@@ -9,7 +9,7 @@ error: they are taken off, as a similarity that fits the centres takes them off.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray

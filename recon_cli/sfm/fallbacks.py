@@ -128,7 +128,7 @@ def find_features(job: MappingJob, report: Reporter) -> FeaturesResult:
     """Fills the database with the features of all frames; see `features.extract_features`."""
     if job.segments:
         join_segments.collect_features(job)
-    by_tracks = not job.known_poses and list_fallbacks(job)[0].name == TRACKS
+    by_tracks = list_fallbacks(job)[0].name == TRACKS
     with skeleton.build_beside(job, report) if by_tracks and job.threads > 1 else nullcontext():
         return features.extract_features(job, report)
 
