@@ -90,7 +90,7 @@ def find_on_faces(
     wanted = _count_in_panorama(job)
     for level in (1, 0):
         table, lowe = _find_on_faces(gray, mask, level)
-        if len(table) >= ENOUGH_FEATURES * wanted:
+        if len(table) >= wanted:
             break
     coarsest = np.argsort(-table[:, 2], kind="stable")[:wanted]
     xy, sizes, angles = table[coarsest, :2], table[coarsest, 2], table[coarsest, 3]
