@@ -39,14 +39,14 @@ class App:
 IDENTITY = np.eye(4)
 Y = (0.0, 1.0, 0.0)
 APPS = {
-    "polycam": App("polycam", polycam, ARKIT, Y, accuracy="solved"),
+    "polycam": App("polycam", polycam, ARKIT, Y),
     "record3d": App("record3d", record3d, None, None),
     "r3d": App("record3d", r3d, None, None),
     "stray": App("stray", stray, ARKIT, Y),
     "nerfcapture": App("nerfcapture", nerfcapture, ARKIT, Y),
     "3dscannerapp": App("3dscannerapp", scanner_app, ARKIT, Y),
     "arkitscenes": App("arkitscenes", arkit_scenes, IDENTITY),
-    "rtabmap": App("rtabmap", rtabmap, IDENTITY, accuracy="solved"),
+    "rtabmap": App("rtabmap", rtabmap, IDENTITY),
     "realityscan": App("realityscan", reality_scan, IDENTITY, metric=False, depth=False,
                         accuracy="solved"),
     "metashape": App("metashape", metashape, IDENTITY, depth=False, accuracy="solved"),

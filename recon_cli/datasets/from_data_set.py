@@ -37,6 +37,9 @@ from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group, KnownPoses
 
+# Units between centres up to which all are one: of metres what a float32 rounds, of any other unit
+# nothing that a program would write.
+SAME_PLACE = 1e-6
 _PLAUSIBLE = (0.1, 20.0)  # metres; the median of depth over the frames of a room
 
 
@@ -82,8 +85,14 @@ def _ingest(
             hint="Check that the images are where the data set says.")
     damaged = {image.path for name, image in zip(names, images, strict=True) if name in broken}
     posed = _write_depth(posed, readable, out, ctx)
-    poses = _make_known_poses(posed, readable, damaged, out, ctx)
-    poses.write(out)
+    poses = None
+    centers = np.linalg.inv([image.viewmat for _, image in readable])[:, :3, 3]
+    if np.ptp(centers, axis=0).max() <= SAME_PLACE:
+        ctx.notice("All poses stand in one place: the data set has turns alone, so the cameras are "
+                   "found from the pictures.")
+    else:
+        poses = _make_known_poses(posed, readable, damaged, out, ctx)
+        poses.write(out)
     masks, lenses = out / store.MASKS, posed.lenses
     sizes = [fit_size(lens.width, lens.height, config.max_size) for lens in lenses]
     return IngestedSource(

@@ -3,8 +3,8 @@
 keyframes/{images,cameras,depth,confidence}/<t>.{jpg,json,png,png}, t in microseconds. Cameras hold
 fx fy cx cy and a 3x4 camera-to-world matrix t_<row><column>, ARKit's camera axes, metres, y up.
 corrected_images with corrected_cameras are undistorted and loop closed, and taken where both are
-there; the others keep a distortion that is written nowhere, and drift. (PolyCam/polyform;
-nerfstudio's polycam_utils.) raw.glb lies in another frame and is not read.
+there, though a drift of a degree remains; the others keep a distortion that is written nowhere.
+(PolyCam/polyform; nerfstudio's polycam_utils.) raw.glb lies in another frame and is not read.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def read_polycam(folder: Path) -> PosedSet:
         "polycam", listed, folder, left_out, missing=missing,
         photos=quoted(place / f"{kind}images"))
     if kind:
-        return replace(posed, accuracy="solved")
+        return posed
     return replace(posed, notices=(*posed.notices, (
         "it has no corrected cameras (loop closure was off, or the capture too long): the poses "
         "drift, and the lens distortion is written nowhere")))

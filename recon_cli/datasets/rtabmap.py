@@ -89,7 +89,7 @@ def read_rtabmap(folder: Path) -> PosedSet:
     posed = tracked_set(
         "rtabmap", listed, folder, left_out, up=Z_UP, bare=bare,
         photos=quoted(_pictures(folder, found[0][0]) or folder))
-    return replace(posed, accuracy="solved", notices=(*posed.notices, *notices))
+    return replace(posed, notices=(*posed.notices, *notices))
 
 
 def _list_camera(

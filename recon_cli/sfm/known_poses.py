@@ -33,7 +33,7 @@ from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
 from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
 from recon_cli.sfm.merge_models import build_posed_model
-from recon_cli.sfm.results import MatchesResult, ModelResult
+from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.verdict import ModelVerdict, check_weak_link, examine
 from recon_cli.workspace.records import KnownPoses, read_poses
 from recon_cli.workspace.summaries import PosesSummary
@@ -46,6 +46,19 @@ NEIGHBOURS = (0, 5)
 FEATURES = 1000  # keypoints an image
 
 Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
+
+
+def find_features(job: MappingJob, report: Reporter) -> FeaturesResult:
+    """Fills the database with the features of all frames; see `features.extract_features`.
+
+    Solved poses that are kept are held against some of the images before. SfmError if they do not
+    fit.
+    """
+    known = _read_poses(job)
+    if (job.pose_use == "keep" and known.accuracy != "tracked" and known.viewmats
+            and not _uncalibrated_cameras(job)):
+        _check_some(job, known)
+    return features.extract_features(job, report)
 
 
 def match_known(job: MappingJob, report: Reporter) -> MatchesResult:
@@ -95,12 +108,12 @@ def neighbours(
     return nearest
 
 
-def build_known_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelResult:
+def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     """Writes the model of the given cameras into out/model and returns what it holds.
 
     Where poses are a start that the pictures refute, the model of the pictures alone, unless
-    `refine` asks for the poses; `deadline` as for `fallbacks.build_model`. SfmError if too few
-    frames have a pose, or the poses do not fit the images.
+    `refine` asks for the poses. SfmError if too few frames have a pose, or the poses do not fit the
+    images.
     """
     known = _read_poses(job)
     if job.pose_use == "keep":
@@ -121,7 +134,7 @@ def build_known_model(job: MappingJob, report: Reporter, *, deadline: float) -> 
         matching.match_pairs(job, matching_again, report)
     else:
         reason = _misfit(share, MIN_SPOT_AGREEING).message
-    found = fallbacks.build_model(job, report, deadline=deadline)
+    found = fallbacks.build_model(job, report)
     return replace(
         found, notes=(f"{reason} The cameras were found from the pictures alone.", *found.notes),
         poses=PosesSummary(use="refuted", metric=known.metric))
@@ -133,10 +146,7 @@ def _keep(job: MappingJob, known: KnownPoses, report: Reporter) -> ModelResult:
     report.phase("mapping", len(job.names))
     if "features" not in job.steps:
         model, verdict = _build_given_model(job, known), None
-        check = spot_check(job, known.viewmats)
-        if not check.fits:
-            raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
-        notes = [check.describe()]
+        notes = [_check_some(job, known).describe()]
     else:
         posed = build_posed_model(job.database, None, _rigid(known.viewmats, known.viewmats))
         model = mapper.triangulate(job, posed, refine_intrinsics=bool(_uncalibrated_cameras(job)))
@@ -171,6 +181,14 @@ def _start_from(
     return _write(job, model, verdict, notes, PosesSummary(
         use=job.pose_use, metric=known.metric, held=len(found.held),
         reprojection_error_px_before=found.error_before, **moved))
+
+
+def _check_some(job: MappingJob, known: KnownPoses) -> SpotCheck:
+    """Returns how well sampled images agree with the poses; SfmError if they do not."""
+    check = spot_check(job, known.viewmats)
+    if not check.fits:
+        raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
+    return check
 
 
 def _check_confirmed(job: MappingJob, model: pycolmap.Reconstruction) -> None:

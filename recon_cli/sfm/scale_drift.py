@@ -24,7 +24,12 @@ from recon_cli.errors import format_count
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import view_graph
 from recon_cli.sfm.evidence import MatchEvidence
-from recon_cli.sfm.floor_heights import SPREAD, compare_heights, measure_heights
+from recon_cli.sfm.floor_heights import (
+    compare_heights,
+    compare_sides,
+    measure_heights,
+    weigh_step,
+)
 from recon_cli.sfm.limits import LOSS_SCALE, MIN_FRAMES
 from recon_cli.sfm.sphere import is_panorama, radian_px, ray_frames, unit_rays
 from recon_cli.workspace.json_record import JsonRecord
@@ -100,9 +105,11 @@ def find_weakest_scale(
         ends = between or (names[0], names[-1])
         first, last = sorted(map(names.index, ends))
         cuts += _walk_cuts(information, range(first + 1, last + 1))
-        if max((cut.error for cut in cuts), default=0.0) > DOUBTFUL:
-            heights = measure_heights(model, names)
-            cuts = [_ask_floor(cut, heights) for cut in cuts]
+    panoramas = all(is_panorama(camera) for camera in model.cameras.values())
+    if (order is not None or panoramas) and max(
+            (cut.error for cut in cuts), default=0.0) > DOUBTFUL:
+        heights = measure_heights(model, names)
+        cuts = [_ask_floor(cut, heights, panoramas) for cut in cuts]
     drift = 0.0 if order is None else _sum_drift(information)
     cuts.sort(key=lambda cut: -cut.error)
     return max((_describe(cut, evidence, rows, drift) for cut in cuts
@@ -175,18 +182,17 @@ def _walk_cuts(information: _Information, places: Iterable[int]) -> Iterator[_Cu
                        (before, behind), (place - 1, place))
 
 
-def _ask_floor(cut: _Cut, heights: NDArray[np.float64]) -> _Cut:
-    """Returns a cut of a walk once the heights [F] of its cameras above the floor are known, too.
-
-    Both are taken for normal: what is most likely wrong then, or its deviation if that is more.
-    """
-    changes = np.flatnonzero(np.diff(cut.side)) + 1
-    step = compare_heights(heights, int(changes[0])) if len(changes) == 1 else None
+def _ask_floor(cut: _Cut, heights: NDArray[np.float64], panoramas: bool) -> _Cut:
+    """Returns a cut once the heights [F, 2] of its cameras are known, too."""
+    if panoramas:
+        step = compare_sides(*(heights[part] for part in cut.parts))
+    else:
+        changes = np.flatnonzero(np.diff(cut.side)) + 1
+        step = compare_heights(heights, int(changes[0])) if len(changes) == 1 else None
     if step is None:
         return cut
-    share = cut.error**2 / (cut.error**2 + SPREAD**2)
-    off = share * abs(step)
-    return replace(cut, error=max(off, float(np.sqrt(1 - share)) * cut.error), off=off)
+    error, off = weigh_step(cut.error, step)
+    return replace(cut, error=error, off=off)
 
 
 def _describe(cut: _Cut, evidence: MatchEvidence, rows: Rows, drift: float) -> ScaleCut:

@@ -53,15 +53,15 @@ _BESIDES = {"model": (join_segments.REPORT,), "sparse": (WorldSummary.FILE, VERD
 
 def work(job: MappingJob, report: Reporter) -> None:
     """Runs unfinished steps; SfmError if no model can be trusted, FormatError for a bad frame."""
-    deadline = time.monotonic() + 60 * job.max_minutes
     actions: dict[str, Callable[[], StepResult]] = {
-        "features": lambda: fallbacks.find_features(job, report),
+        "features": lambda: (known_poses if job.known_poses else fallbacks).find_features(
+            job, report),
         "matches": lambda: (
             known_poses.match_known if job.known_poses else fallbacks.match_first)(job, report),
         SPLIT: lambda: join_segments.split_by_view_graph(job),
         "model": lambda: (
             known_poses.build_known_model if job.known_poses else fallbacks.build_model)(
-                job, report, deadline=deadline),
+                job, report),
         "sparse": lambda: undistort.place_model(job),
         "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)

@@ -55,6 +55,21 @@ def test_a_replica_sequence_brings_poses_points_and_its_own_test_views(tmp_path,
     assert summary.points == len(poses.points) > 100
 
 
+@pytest.mark.parametrize(("apart", "kept"), [(0.0, False), (1e-7, False), (1e-4, True)])
+def test_poses_that_are_turns_alone_are_said_and_not_used(tmp_path, notices, apart, kept):
+    folder = make_transforms(tmp_path / "set")
+    file = folder / "transforms.json"
+    listing = json.loads(file.read_text())
+    for place, frame in enumerate(listing["frames"]):
+        for row, line in enumerate(frame["transform_matrix"][:3]):
+            line[3] = 2.0 + apart * place * (row == 0)
+    file.write_text(json.dumps(listing))
+    summary = take(folder, tmp_path / "out")
+    assert (tmp_path / "out" / POSES).exists() == kept
+    assert (summary.metric is not None) == kept
+    assert any("stand in one place" in text for text in notices()) != kept
+
+
 def test_depth_of_views_that_are_held_out_lends_no_points(tmp_path):
     folder = make_replica(tmp_path / "room")
     take(folder, tmp_path / "one")
@@ -260,7 +275,9 @@ def test_depth_that_nothing_shows_leaves_the_unit_open(tmp_path, notices):
     for number, frame in enumerate(value["frames"]):
         frame["depth_file_path"] = f"depth/{number}.png"
         write_depth(tmp_path / "set" / "depth" / f"{number}.png", plane_depth(pose(0)), 1000)
-        frame["transform_matrix"] = value["frames"][0]["transform_matrix"]
+        frame["transform_matrix"] = [
+            [*row[:3], row[3] + 1e-5 * number] for row in value["frames"][0]["transform_matrix"][:3]
+        ] + [[0, 0, 0, 1]]
     summary = take(make_transforms(tmp_path / "set", value), tmp_path / "out")
     assert not summary.metric
     assert summary.points > 100

@@ -12,6 +12,7 @@ from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images, read_points, read_scene
 from recon_cli.io.images import read_png, write_png
 from recon_cli.scene.camera import Lens
+from recon_cli.sfm import database
 from recon_cli.workspace.records import Frame, FrameList, Group, KnownPoses
 from recon_cli.workspace.summaries import PosesSummary, SfmSummary
 
@@ -98,6 +99,16 @@ def test_wrong_poses_are_refused_although_points_came_with_them(
     with pytest.raises(SfmError, match="The given poses do not fit the images"):
         run_here(room, tmp_path / "out")
     assert not (tmp_path / "out" / "sparse").exists()
+
+
+def test_wrong_poses_that_are_kept_are_refused_before_all_images_are_looked_at(
+    room, truth, given, tmp_path
+):
+    given({name: np.diag([1.0, -1, -1, 1]) @ viewmat for name, viewmat in truth.items()})
+    with pytest.raises(SfmError, match="The given poses do not fit the images") as caught:
+        run_here(room, tmp_path / "out")
+    assert "axes" in caught.value.hint
+    assert database.keypoint_counts(tmp_path / "out" / "database.db") == {}
 
 
 @pytest.mark.integration
