@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from recon_cli.errors import list_names
 from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.records import BASE, PRUNED
@@ -100,6 +101,10 @@ def judge_poses(sfm: StageReport, failed: Sequence[ViewScore] = ()) -> PosesVerd
         return PosesVerdict("warn", (
             f"Only a part of the capture is kept, whose camera poses can be trusted: {count}; "
             f"{left_out:,} are left out whose cameras could not be trusted."), lines)
+    if summary.rough:
+        return PosesVerdict("warn", (
+            f"{count}, and nothing speaks against them, but {len(summary.rough)} of them are known "
+            f"badly: {list_names(summary.rough)}."), lines)
     if failed:
         others = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
         return PosesVerdict("warn", (

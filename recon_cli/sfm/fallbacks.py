@@ -186,8 +186,10 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
             if attempt.lenses:
                 ways.insert(0, _with_lenses(attempt.lenses))
             if ways and attempt.seconds > 60 * MINUTES_TOLD:
+                told = any(before.shortfall == reason for before in attempts[:-1])
                 report.tell(f"trying another mapper, for about "
-                            f"{format_minutes(FURTHER * attempt.seconds)} more: {reason}")
+                            f"{format_minutes(FURTHER * attempt.seconds)} more"
+                            f"{'' if told else f': {reason}'}")
     return _publish_best(job, attempts, verdicts)
 
 

@@ -42,7 +42,7 @@ MAX_SCALE_INTERVAL = 0.15
 MIN_SURE_EXPLAINED = 0.85  # share of the matches across that the cameras must explain for that
 DOUBTFUL = MAX_SCALE_ERROR / 3  # the floor is looked at from here on
 _RIDGE = 1e-10  # times the diagonal: position, turn and scale of the model are free
-_POSE = 6  # unknowns of a camera: its turn, and its centre
+POSE = 6  # unknowns of a camera: its turn, and its centre
 _STEP = 1e-5  # of a number of the lens, as a share of it or, below 1, of 1
 
 Rows = NDArray[np.int64]
@@ -209,12 +209,12 @@ class _Information:
     """What the observations of a model say about its cameras, all points being free."""
 
     def __init__(self, model: pycolmap.Reconstruction, order: Sequence[str]) -> None:
-        seen = _Observations(model, order)
+        seen = Observations(model, order)
         self.centers, self._depths = seen.centers, seen.depths
         self._reach = max(  # of a stretch, the diagonal of the box around its cameras
             LEAST_EXTENT * float(np.linalg.norm(np.ptp(seen.centers, axis=0))),
             LEAST_DEPTHS * float(np.median(seen.depths)), 1e-300)
-        self._factor, self._variance = _factorise(seen)
+        self._factor, self._variance = factorise(seen)
 
     def error(self, before: Rows, behind: Rows) -> float:
         """Returns how well the relative scale of two stretches is known, as `ScaleCut.error`."""
@@ -264,13 +264,13 @@ class _Information:
 
         The scale is that of the similarity that fits their centres best.
         """
-        change = np.zeros((len(self.centers), _POSE))
+        change = np.zeros((len(self.centers), POSE))
         arms = self.centers[rows] - self.centers[rows].mean(axis=0)
         change[rows, 3:] = arms / (arms**2).sum()
         return np.append(change.ravel(), np.zeros(self._factor.shape[0] - change.size))
 
 
-class _Observations:
+class Observations:
     """O observations of P points by F images, in the images' order, with their derivatives."""
 
     def __init__(self, model: pycolmap.Reconstruction, order: Sequence[str]) -> None:
@@ -333,7 +333,7 @@ class _Observations:
         self.by_camera = root * np.concatenate([-by_local @ turn, -by_point], axis=2)
         self.by_point = root * by_point
         self.by_lens = -root * focal[:, :, None] * self.by_lens
-        free = 2 * len(rays) - _POSE * len(self.centers) - 3 * self.points
+        free = 2 * len(rays) - POSE * len(self.centers) - 3 * self.points
         self.variance = float(weights @ sizes**2) / max(free, 1)  # pixels squared
 
 
@@ -358,7 +358,7 @@ def _derive_by_lens(
     return np.nan_to_num(changes)  # a bent lens has no direction for some pixels
 
 
-def _factorise(seen: _Observations) -> tuple[SuperLU, float]:
+def factorise(seen: Observations) -> tuple[SuperLU, float]:
     """Returns the factors of the normal equations of the cameras, and the variance of an error."""
     count, points = len(seen.centers), seen.points
     cameras = hstack([

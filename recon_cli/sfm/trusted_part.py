@@ -163,6 +163,8 @@ def _sides(job: MappingJob, cameras: Collection[str], verdict: ModelVerdict) -> 
         yield from verdict.scale.sides
     elif len(verdict.model_parts) > 1:
         yield from verdict.model_parts
+    elif verdict.rough:
+        yield tuple(name for name in cameras if name not in verdict.rough)
     elif leap := next((jump for jump in verdict.jumps if jump.ratio > MAX_LEAP), None):
         ordered = sorted(cameras, key=lambda name: (job.times.get(name, 0.0), name))
         after = ordered.index(leap.after)

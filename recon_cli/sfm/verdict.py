@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import SfmError, format_count, list_names
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm import view_graph, visual_aliasing
+from recon_cli.sfm import camera_covariance, view_graph, visual_aliasing
 from recon_cli.sfm.evidence import MatchEvidence, gather_evidence
 from recon_cli.sfm.lens_trial import BetterLens, find_better_lenses
 from recon_cli.sfm.limits import FEW_KEYPOINTS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
@@ -109,11 +109,18 @@ class ModelVerdict(JsonRecord):
     open_loops: tuple[OpenLoop, ...]  # the one that most points show first
     problems: tuple[str, ...]  # why the model cannot be trusted, a sentence each
     lenses: tuple[BetterLens, ...] = ()  # cameras that another camera model fits better
+    # Of photos: how far the centre of each camera is likely off, as a share of the extent of all.
+    camera_errors: camera_covariance.Errors = field(default_factory=dict)
 
     @property
     def trusted(self) -> bool:
         """Whether nothing speaks against the model."""
         return not self.problems
+
+    @property
+    def rough(self) -> Names:
+        """The cameras that are known badly, though nothing speaks against them."""
+        return camera_covariance.list_rough(self.camera_errors)
 
     def lines(self) -> list[str]:
         """Returns a short text for the terminal."""
@@ -121,6 +128,7 @@ class ModelVerdict(JsonRecord):
         lines = [f"{self.registered} of {format_count(self.images, 'image')} "
                  f"{'has' if self.registered == 1 else 'have'} a camera; the model is {head}."]
         lines += self.problems or self._reassurances()
+        lines += camera_covariance.describe_rough(self.camera_errors)
         lines += [
             f"Step {jump.ratio:.0f} times as long as usual: {jump.before} to {jump.after}."
             for jump in self.jumps]
@@ -146,10 +154,13 @@ class ModelVerdict(JsonRecord):
                    "surfaces that they should share as cameras within one group do.")
         if self.scale is not None:
             yield describe_scale(self.scale)
+        if self.camera_errors:
+            yield (f"Cameras: known to {camera_covariance.measure_rms(self.camera_errors):.1%} of "
+                   "their extent (RMS).")
 
     def to_json(self) -> dict[str, Any]:
-        """Returns JSON values: the fields, and whether the model is trusted."""
-        return {**super().to_json(), "trusted": self.trusted}
+        """Returns JSON values: the fields, whether the model is trusted, and rough cameras."""
+        return {**super().to_json(), "trusted": self.trusted, "rough": list(self.rough)}
 
 
 def examine(
@@ -176,6 +187,8 @@ def examine(
     jumps = find_jumps(evidence, times or {})
     still = find_still_share(model)
     better = find_better_lenses(model, lenses)
+    errors = {} if given or times else camera_covariance.estimate_camera_errors(
+        model, [name for name, count in zip(names, evidence.points, strict=True) if count])
     return ModelVerdict(
         images=len(names), registered=int(np.count_nonzero(rows)),
         model_parts=model_parts, match_parts=match_parts,
@@ -185,9 +198,10 @@ def examine(
         points=Histogram.from_values(evidence.points[rows]),
         neighbours=Histogram.from_values(
             np.count_nonzero(evidence.shared[rows] >= MIN_POSE_INLIERS, axis=1)),
-        still=still, scale=scale, open_loops=loops, lenses=better,
+        still=still, scale=scale, open_loops=loops, lenses=better, camera_errors=errors,
         problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
                   *_describe_drift(loops, scale), *_describe_still(still),
+                  *camera_covariance.describe_inexact(errors),
                   *describe_shifted_centres(model, database),
                   *(lens.sentence() for lens in better if lens.is_wrong)))
 

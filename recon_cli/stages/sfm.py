@@ -6,6 +6,7 @@ The original frames are mapped, as filters move corners; denoised twins take the
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from recon_cli.config.stages import SfmConfig
@@ -232,6 +233,10 @@ def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
             ctx.tell(sentence, detail=True)
         else:
             ctx.notice(sentence)
+    if sound and summary.rough:
+        ctx.notice(f"{len(summary.rough)} of {summary.registered} cameras are rough, known badly "
+                   f"for too few points in common: {list_names(summary.rough)}; `recon report` "
+                   "says how badly.")
     for sentence in (*_describe_parts(summary, frames),
                      *_describe_left_out(summary, frames, named=not sound)):
         ctx.notice(sentence)
@@ -241,8 +246,10 @@ def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
 
 def _attempts(attempts: Sequence[AttemptSummary]) -> Iterator[str]:
     """Yields a sentence for each mapper that was tried after the first."""
-    for attempt in attempts[1:]:
+    for before, attempt in pairwise(attempts):
         reason = attempt.reason[:1].lower() + attempt.reason[1:].rstrip(".")  # may be a sentence
+        if attempt.reason == before.reason:
+            reason = "that was so again"
         if attempt.skipped:
             yield (f"{attempt.name} was not tried (because {reason}): {attempt.skipped}, and "
                    "there is less time left.")

@@ -180,6 +180,11 @@ class SfmSummary(JsonRecord):
         """Whether the verdict trusts the model; None without a verdict."""
         return None if self.verdict is None else bool(self.verdict["trusted"])
 
+    @property
+    def rough(self) -> tuple[str, ...]:
+        """The frames whose cameras are known badly, though nothing speaks against them."""
+        return () if self.verdict is None else tuple(self.verdict.get("rough", ()))
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrialDecision(JsonRecord):
