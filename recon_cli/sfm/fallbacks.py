@@ -1,7 +1,8 @@
 """The mappers that are tried for a capture, from the quickest to the last resort.
 
-A good capture stops at the first. The next one is tried where the model was not good enough, and it
-is expected to end in time; matches stay in the database. The best of all models is the result.
+A good capture stops at the first. The next one is tried where the model was not good enough, and
+there is not too much to do; matches stay in the database. The best of all models is the result.
+What there is to do is counted, not timed: a busy machine tries what an idle one does.
 
 Each finished attempt is recorded, so that an interrupted run continues after it. An interrupted
 mapping starts again: continued from COLMAP's snapshot, its result would differ.
@@ -41,7 +42,7 @@ from recon_cli.sfm.limits import (
 )
 from recon_cli.sfm.merge_models import ModelCandidate
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
-from recon_cli.sfm.time_estimate import format_minutes
+from recon_cli.sfm.time_estimate import COSTS, format_minutes
 from recon_cli.sfm.trusted_part import cuts_models, deliver_parts
 from recon_cli.sfm.verdict import ModelVerdict, examine
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
@@ -54,8 +55,10 @@ RELAXED_BRIDGE = "bridge relaxed"  # with the database of the former, and lower 
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW_PHOTOS = 30
-# How much longer than the longest attempt so far a mapping may take. Relaxed thresholds took 0.8
-# and 2.3 times as long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
+# CPU seconds of the machine of `COSTS` for a pair of 3,000 keypoints, verification included.
+PAIR_SECONDS = 0.05
+# How much longer than the first a mapping may take. Relaxed thresholds took 0.8 and 2.3 times as
+# long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
 # How many times as long as the attempt before it a further one usually takes (1.1 to 2.4 in three
 # captures), and the minutes of an attempt from which on the user is told.
@@ -150,11 +153,12 @@ def match_first(job: MappingJob, report: Reporter) -> MatchesResult:
     return matching.count_matches(job)
 
 
-def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelResult:
+def build_model(job: MappingJob, report: Reporter) -> ModelResult:
     """Writes the best model of all attempts that were needed into out/model.
 
-    The matches of the first fallback are in the database. At `deadline`, in monotonic seconds, the
-    process is ended; sooner, after `spare_minutes`, a model that can be trusted is enough.
+    The matches of the first fallback are in the database. No further attempt is made that would
+    bring the work of all above `max_minutes` of one core, or above `spare_minutes` where a model
+    can be trusted.
     SfmError if too few frames have a camera, they see the points from one place,
     or the parts of the model are too weakly connected.
     """
@@ -167,9 +171,7 @@ def build_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelR
         fallback = ways.pop(0)
         attempt = log.result(fallback.name, MapperAttempt)
         if attempt is None:
-            attempt, candidate = _try_fallback(
-                job, fallback, reason, attempts, report,
-                deadline - 60 * _unneeded_minutes(job, attempts))
+            attempt, candidate = _try_fallback(job, fallback, reason, attempts, report)
             if candidate is not None:
                 verdicts[fallback.name] = candidate.verdict
             log.finish(fallback.name, attempt, job.attempts / fallback.name)
@@ -370,19 +372,16 @@ def best_attempt(attempts: Sequence[MapperAttempt]) -> MapperAttempt | None:
 
 def _try_fallback(
     job: MappingJob, fallback: Fallback, reason: str, before: Sequence[MapperAttempt],
-    report: Reporter, deadline: float,
+    report: Reporter,
 ) -> tuple[MapperAttempt, ModelCandidate | None]:
     """Writes the model of a fallback into its folder and returns what became of it."""
     folder = fresh_folder(job.attempts / fallback.name)
-    start = time.monotonic()
+    start = time.monotonic()  # for the summary alone
     # Those of the first are matched.
     wanted = fallback.choose_pairs(job, report) if before else set()
-    matched = StepLog(job.out).result("matches", MatchesResult)
-    per_pair = matched.seconds / max(1, matched.rows) if matched else 0.0
-    expected = (len(wanted - database.pair_names(job.database)) * per_pair
-                + SLOWER * max((attempt.seconds for attempt in before), default=0.0))
-    if before and start + expected > deadline:
-        skipped = f"it would take about {expected / 60:.0f} minutes"
+    work = _count_seconds(job, wanted, sum(not attempt.skipped for attempt in before))
+    if before and work > 60 * (job.max_minutes - _unneeded_minutes(job, before)):
+        skipped = f"all would take about {work / 60:.0f} minutes of a core"
         return MapperAttempt(fallback.name, reason, skipped=skipped), None
     if wanted:
         matching.match_pairs(job, wanted, report)
@@ -410,6 +409,13 @@ def _try_fallback(
         {str(lens.camera): lens.better for lens in found},
         list_thin(candidate.model) if may_bridge(job) else ())
     return attempt, candidate
+
+
+def _count_seconds(job: MappingJob, wanted: Collection[matching.Pair], tried: int) -> float:
+    """Returns the CPU seconds of all attempts with a further one, on the machine of `COSTS`."""
+    mapping = COSTS.photo_mapping if job.tracks is None else COSTS.walk_mapping
+    pairs = len(database.pair_names(job.database).union(wanted))
+    return PAIR_SECONDS * pairs + mapping * len(job.names) * (tried + SLOWER)
 
 
 def _publish_best(

@@ -10,8 +10,7 @@ import dataclasses
 import json
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -314,24 +313,6 @@ class Reporter:
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self._sending = threading.Lock()
-
-    @contextmanager
-    def polling(self, count: Callable[[], int]) -> Iterator[None]:
-        """Reports `count()`, called in a thread, at intervals and at the end."""
-        ended = threading.Event()
-
-        def report() -> None:
-            while not ended.wait(POLL_SECONDS):
-                self.done(count())
-
-        thread = threading.Thread(target=report, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
-        self.done(count())
 
     def phase(self, name: str, total: int, *, done: int = 0) -> None:
         """Reports that a phase begins; see `Phase`."""

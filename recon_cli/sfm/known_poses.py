@@ -95,12 +95,12 @@ def neighbours(
     return nearest
 
 
-def build_known_model(job: MappingJob, report: Reporter, *, deadline: float) -> ModelResult:
+def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     """Writes the model of the given cameras into out/model and returns what it holds.
 
     Where poses are a start that the pictures refute, the model of the pictures alone, unless
-    `refine` asks for the poses; `deadline` as for `fallbacks.build_model`. SfmError if too few
-    frames have a pose, or the poses do not fit the images.
+    `refine` asks for the poses. SfmError if too few frames have a pose, or the poses do not fit the
+    images.
     """
     known = _read_poses(job)
     if job.pose_use == "keep":
@@ -121,7 +121,7 @@ def build_known_model(job: MappingJob, report: Reporter, *, deadline: float) -> 
         matching.match_pairs(job, matching_again, report)
     else:
         reason = _misfit(share, MIN_SPOT_AGREEING).message
-    found = fallbacks.build_model(job, report, deadline=deadline)
+    found = fallbacks.build_model(job, report)
     return replace(
         found, notes=(f"{reason} The cameras were found from the pictures alone.", *found.notes),
         poses=PosesSummary(use="refuted", metric=known.metric))

@@ -14,13 +14,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 from recon_cli.errors import ExitCode, ReconError, SfmError, format_count
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
-from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, parse
+from recon_cli.sfm.job import LOCK, LOG_FILE, POLL_SECONDS, Event, MappingJob, Phase, parse
 from recon_cli.workspace.disk import refuse_full_disk
 from recon_cli.workspace.journal import make_way
 
@@ -113,23 +114,38 @@ class CrashError(SfmError):
     """The mapping process crashed for reasons unrelated to the capture."""
 
 
+class TimeUpError(SfmError):
+    """The mapping process took more than --max-minutes."""
+
+
 def run_job(
     job: MappingJob, *, progress: Progress, record: Callable[[int, int], None],
     on_idle: Callable[[], None],
 ) -> None:
     """Runs a job in a process of its own; its results are in the step log. See also `Monitor`.
 
-    SfmError if no model can be trusted or the time is up; CrashError if the process crashed;
-    FormatError if a frame cannot be read; WorkspaceError if another process works in the folder;
-    OSError as met in the process: the disk is full or not writable.
+    Where the time is up, the best of the attempts that have ended is the result.
+    SfmError if no model can be trusted or no attempt has ended in time; CrashError if the process
+    crashed; FormatError if a frame cannot be read; WorkspaceError if another process works in the
+    folder; OSError as met in the process: the disk is full or not writable.
     """
-    max_minutes = job.max_minutes
+    try:
+        _run(job, job.max_minutes, Monitor(job, progress, record, on_idle))
+    except TimeUpError as error:
+        if not (job.attempts / LOG_FILE).is_file():
+            raise
+        logger.warning("sfm: %s The best model so far is taken.", error.message)
+        _run(replace(job, max_minutes=0.0), job.max_minutes,
+             Monitor(job, progress, record, on_idle))
+
+
+def _run(job: MappingJob, max_minutes: float, monitor: Monitor) -> None:
+    """Runs a job for so many minutes at most; raises as `run_job`."""
     deadline = time.monotonic() + 60 * max_minutes
     file = job.out / "job.json"
     job.write(file)
     for kept in (job.out / LOG, job.out / LOCK):
         make_way(kept)
-    monitor = Monitor(job, progress, record, on_idle)
     try:
         with _start(job, file) as child, monitor:
             for event in _events(child):
@@ -161,11 +177,14 @@ def run_job(
 
 @contextmanager
 def _start(job: MappingJob, file: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Yields the running process and kills it on leaving, however that happens."""
-    threads = str(job.threads)
+    """Yields the running process and kills it on leaving, however that happens.
+
+    What several threads share is shared out in here: sums that BLAS or OpenMP split among threads
+    differ with their number.
+    """
     with (job.out / LOG).open("ab") as log, start_module(
         "recon_cli.sfm.worker", str(file), folder=job.out, out=subprocess.PIPE, errors=log,
-        OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads,
+        OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1",
     ) as child:
         try:
             yield child
@@ -196,8 +215,8 @@ def _events(child: subprocess.Popen[bytes]) -> Iterator[Event | None]:
         yield parse(line)
 
 
-def _timeout_error(max_minutes: float, monitor: Monitor) -> SfmError:
-    return SfmError(
+def _timeout_error(max_minutes: float, monitor: Monitor) -> TimeUpError:
+    return TimeUpError(
         f"The cameras were not found within {max_minutes:g} minutes; the last step was "
         f"{monitor.doing}.",
         hint="Allow more time with --max-minutes (features and matches found so far are kept), or "

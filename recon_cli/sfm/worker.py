@@ -53,7 +53,6 @@ _BESIDES = {"model": (join_segments.REPORT,), "sparse": (WorldSummary.FILE, VERD
 
 def work(job: MappingJob, report: Reporter) -> None:
     """Runs unfinished steps; SfmError if no model can be trusted, FormatError for a bad frame."""
-    deadline = time.monotonic() + 60 * job.max_minutes
     actions: dict[str, Callable[[], StepResult]] = {
         "features": lambda: fallbacks.find_features(job, report),
         "matches": lambda: (
@@ -61,7 +60,7 @@ def work(job: MappingJob, report: Reporter) -> None:
         SPLIT: lambda: join_segments.split_by_view_graph(job),
         "model": lambda: (
             known_poses.build_known_model if job.known_poses else fallbacks.build_model)(
-                job, report, deadline=deadline),
+                job, report),
         "sparse": lambda: undistort.place_model(job),
         "undistorted": lambda: undistort.undistort(job, report)}
     log = StepLog(job.out)

@@ -1,9 +1,8 @@
 import errno
 import io
+import itertools
 import json
-import math
 import sqlite3
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,8 +30,8 @@ GOOD = MapperAttempt(
     "exhaustive", "", registered=NAMES, trusted=True, weak_link=0.95, reprojection_error_px=0.5)
 
 
-def build(job, deadline=math.inf):
-    return fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=deadline)
+def build(job):
+    return fallbacks.build_model(job, Reporter(io.BytesIO()))
 
 
 @pytest.fixture
@@ -242,7 +241,7 @@ def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
     monkeypatch.setattr(mapper, "map_incrementally", nothing)
     monkeypatch.setattr(fallbacks, "MINUTES_TOLD", -1)
     stream = io.BytesIO()
-    fallbacks.build_model(job, Reporter(stream), deadline=math.inf)
+    fallbacks.build_model(job, Reporter(stream))
     told = [event for line in stream.getvalue().splitlines()
             if isinstance(event := parse(line), str) and "another mapper" in event]
     assert len(told) == 1
@@ -275,12 +274,25 @@ def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
 
 
 @pytest.mark.usefixtures("few_pairs")
-def test_a_mapper_that_would_take_too_long_is_skipped(capture, monkeypatch):
+@pytest.mark.parametrize(("minutes", "skipped"), [(0.0, True), (1.0, False)])
+def test_a_mapper_is_skipped_by_the_work_that_is_left_and_by_no_clock(
+        capture, monkeypatch, minutes, skipped):
     job, _ = capture
+    clock = itertools.count(step=3600)  # as on a machine that is busy with something else
+    monkeypatch.setattr(fallbacks.time, "monotonic", lambda: next(clock))
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "the model cannot be trusted")
-    result = build(job, deadline=0.0)
-    assert [bool(attempt.skipped) for attempt in result.attempts] == [False, True, True]
+    result = build(replace(job, max_minutes=minutes))
+    assert [bool(attempt.skipped) for attempt in result.attempts] == [False, skipped, skipped]
     assert result.parts[0].registered == job.names
+
+
+def test_the_work_of_a_further_mapper_grows_with_pairs_frames_and_attempts(capture):
+    job, _ = capture
+    seconds = [fallbacks._count_seconds(*each) for each in (
+        (job, set(), 1), (job, {("a.png", "b.png")}, 1), (job, set(), 2), (sized(job, 40), set(), 1)
+    )]
+    assert min(seconds) == seconds[0] > 0
+    assert len(set(seconds)) == 4
 
 
 @pytest.mark.usefixtures("few_pairs")
@@ -290,8 +302,7 @@ def test_late_mappers_improve_no_model_that_is_enough_but_replace_one_that_is_no
     job, _ = capture
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "some frames are apart")
     monkeypatch.setattr(fallbacks.checks, "check_registered", lambda *_: None)
-    result = build(replace(job, min_registered=least, max_minutes=20.0, spare_minutes=0.0),
-                   deadline=time.monotonic() + 60 * 20)
+    result = build(replace(job, min_registered=least, max_minutes=20.0, spare_minutes=0.0))
     assert [not attempt.skipped for attempt in result.attempts] == tried
     assert result.parts[0].registered == job.names
 

@@ -1,6 +1,8 @@
 """The database, the choice of pairs, and their matching."""
 
 import io
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +15,13 @@ from sfm_inputs import texture
 from recon_cli.errors import FormatError
 from recon_cli.io.images import write_png
 from recon_cli.scene.camera import Lens
-from recon_cli.sfm import database
-from recon_cli.sfm import job as sfm_job
+from recon_cli.sfm import database, matching
 from recon_cli.sfm.features import extract_features
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, parse
 from recon_cli.sfm.matching import (
     create_database,
     exhaustive_pairs,
+    match_descriptors,
     match_pairs,
     sequential_pairs,
     similar_pairs,
@@ -142,15 +144,93 @@ def textured(job, **changes):
     return job
 
 
-def test_progress_is_reported_up_to_the_last_pair(job, monkeypatch):
-    monkeypatch.setattr(sfm_job, "POLL_SECONDS", 0.001)
+def test_progress_is_reported_up_to_the_last_pair(job):
     job, stream = textured(job), io.BytesIO()
     extract_features(job, Reporter(io.BytesIO()))
     match_pairs(job, exhaustive_pairs(job.names), Reporter(stream))
     phase, *counts = map(parse, stream.getvalue().splitlines())
     assert (phase.done, phase.total) == (0, 3)
-    assert counts == sorted(counts)
-    assert counts[-1] == 3
+    assert counts == [1, 2, 3]
+
+
+def look_alike(counts, seed=0):
+    """Descriptors [K, 128] of images that show the same things, with noise, in another order."""
+    noise = np.random.default_rng(seed)
+    things = noise.gamma(0.5, 20, (max(counts), 128))
+    images = [things[noise.permutation(max(counts))[:count]] for count in counts]
+    return [np.clip(512 * rows / np.linalg.norm(rows, axis=1, keepdims=True), 0, 255).astype(
+        np.uint8) for rows in (each + noise.gamma(0.5, 12, each.shape) for each in images)]
+
+
+def match_by_definition(ours, theirs):
+    """Matches of one row after the other, in whole numbers."""
+    products = ours.astype(np.int64) @ theirs.T.astype(np.int64)
+    angles = np.arccos(np.minimum(products / 512**2, 1))
+    matches = []
+    for row in range(len(ours) if len(theirs) else 0):
+        column = int(angles[row].argmin())
+        angle = angles[row, column]
+        others = [*np.delete(angles[row], column), *np.delete(angles[:, column], row), np.pi / 2]
+        if angle <= 0.7 and angle == angles[:, column].min() and angle < 0.8 * min(others):
+            matches.append((row, column))
+    return np.array(matches, np.uint32).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("counts", [(90, 70), (70, 90), (40, 1), (1, 1), (0, 5), (5, 0)])
+@pytest.mark.parametrize("chunk", [16, 1024])
+def test_matches_are_those_of_their_definition(counts, chunk, monkeypatch):
+    monkeypatch.setattr(matching, "CHUNK", chunk)
+    ours, theirs = look_alike(counts)
+    found = match_descriptors(ours, theirs)
+    np.testing.assert_array_equal(found, match_by_definition(ours, theirs))
+    assert found.dtype == np.uint32
+    assert len(found) > 30 or min(counts) < 2
+
+
+def test_two_equal_descriptors_are_no_match_of_a_third():
+    ours, theirs = look_alike((60, 60))
+    (row, column), *_ = match_descriptors(ours, theirs)
+    assert (row, column) not in match_descriptors(np.concatenate([ours, ours[[row]]]), theirs)
+    assert row not in match_descriptors(ours, np.concatenate([theirs, theirs[[column]]]))[:, 0]
+
+
+def test_the_matches_are_those_of_colmaps_brute_force(job):
+    job = textured(job)
+    for seed, name in enumerate(NAMES):  # the same texture, moved
+        write_png(job.frames / name, np.roll(texture(180, 240, 0), 9 * seed, axis=1))
+    extract_features(job, Reporter(io.BytesIO()))
+    match_pairs(job, exhaustive_pairs(NAMES), Reporter(io.BytesIO()))
+    ours = read_matches(job)
+    with pycolmap.Database.open(job.database) as opened:
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+    options = pycolmap.FeatureMatchingOptions()
+    options.sift.cpu_brute_force_matcher = True
+    pycolmap.match_exhaustive(job.database, options)
+    theirs = read_matches(job)
+    assert min(map(len, ours)) > 30
+    for found, expected in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def read_matches(job):
+    with pycolmap.Database.open(job.database) as opened:
+        return [opened.read_matches(*pair) for pair in ((1, 2), (1, 3), (2, 3))]
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_any_number_of_threads_writes_the_same_rows(job, threads):
+    job = textured(job)
+    extract_features(job, Reporter(io.BytesIO()))
+    tables = []
+    for count in (1, threads):
+        database.clear_matches(job.database)
+        match_pairs(replace(job, threads=count), exhaustive_pairs(NAMES), Reporter(io.BytesIO()))
+        with closing(sqlite3.connect(job.database)) as connection:
+            tables.append([connection.execute(f"SELECT * FROM {table}").fetchall()
+                           for table in ("matches", "two_view_geometries")])
+    assert tables[0] == tables[1]
+    assert [len(rows) for rows in tables[0]] == [3, 3]
 
 
 def names(count):

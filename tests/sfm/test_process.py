@@ -1,12 +1,16 @@
 """The mapping process: its failures, its log, and what its events say."""
 
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from recon_cli.progress import NullProgress
-from recon_cli.sfm.job import STEPS, Phase
-from recon_cli.sfm.process import Monitor, last_error
+from recon_cli.sfm import process
+from recon_cli.sfm.job import LOG_FILE, STEPS, Phase
+from recon_cli.sfm.process import Monitor, TimeUpError, last_error, run_job
 
 GLOG = "I20260101 10:00:00.000001 139 timer.cc:90] Elapsed time: 0.1 [minutes]\n"
 
@@ -59,3 +63,30 @@ def test_a_core_is_reported_idle_once_when_all_pairs_are_matched(events, idle):
         for event in events:
             monitor.show(event)
     assert len(calls) == idle
+
+
+@dataclass
+class Attempts:
+    """What a job needs to know of itself here."""
+
+    attempts: Path
+    max_minutes: float = 5.0
+
+
+@pytest.mark.parametrize("tried", [True, False])
+def test_when_the_time_is_up_the_best_attempt_that_ended_is_the_result(
+        tmp_path, monkeypatch, tried):
+    runs = []
+
+    def run(job, limit, _):
+        runs.append((job.max_minutes, limit))
+        if len(runs) == 1:
+            raise TimeUpError("The cameras were not found within 5 minutes.")
+
+    monkeypatch.setattr(process, "_run", run)
+    monkeypatch.setattr(process, "Monitor", lambda *_: None)
+    if tried:
+        (tmp_path / LOG_FILE).write_text("{}")
+    with nullcontext() if tried else pytest.raises(TimeUpError):
+        run_job(Attempts(tmp_path), progress=NullProgress(), record=print, on_idle=print)
+    assert runs == [(5.0, 5.0), (0.0, 5.0)][:1 + tried]

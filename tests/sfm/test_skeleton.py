@@ -331,13 +331,14 @@ def test_models_that_tracks_leave_apart_are_joined_by_matches(tmp_path):
 def make_photos(folder, made):
     """A job whose database holds features, those of one point alike in all images, and no match."""
     job = make_job(folder, made)
-    looks = np.random.default_rng(3).integers(0, 60, (len(made.points), 128), dtype=np.uint8)
+    looks = np.random.default_rng(3).random((len(made.points), 128))
+    looks *= 512 / np.linalg.norm(looks, axis=1, keepdims=True)  # as long as SIFT's
     with pycolmap.Database.open(job.database) as opened:
         opened.clear_matches()
         opened.clear_two_view_geometries()
         for index in range(len(made.names)):
             opened.write_descriptors(index + 1, pycolmap.FeatureDescriptors(
-                pycolmap.FeatureExtractorType.SIFT, looks[made._seen(index)[0]]))
+                pycolmap.FeatureExtractorType.SIFT, looks[made._seen(index)[0]].astype(np.uint8)))
     return job
 
 

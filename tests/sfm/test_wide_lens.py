@@ -106,7 +106,7 @@ def capture_of(folder, lens, count=8, points=900):
 
 def test_a_fisheye_is_mapped_as_one_and_its_distortion_is_found(tmp_path):
     job, centers = capture_of(tmp_path, FISHEYE)
-    result = fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=float("inf"))
+    result = fallbacks.build_model(job, Reporter(io.BytesIO()))
     (attempt,) = result.attempts
     assert (attempt.name, attempt.reason) == (
         "fisheye", "the matches are those of a fisheye lens")
@@ -136,7 +136,7 @@ def test_where_the_incremental_mapper_cannot_start_the_global_one_is_asked(tmp_p
 def test_a_lens_that_the_errors_show_is_mapped_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(wide_lens, "CLEARLY", np.inf)  # its matches pass for an ordinary lens
     job, _ = capture_of(tmp_path, FISHEYE)
-    result = fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=float("inf"))
+    result = fallbacks.build_model(job, Reporter(io.BytesIO()))
     assert [attempt.name for attempt in result.attempts] == ["exhaustive", "lens"]
     assert [attempt.kept for attempt in result.attempts] == [False, True]
     assert "OPENCV_FISHEYE" in result.attempts[1].reason
@@ -149,10 +149,10 @@ def test_a_lens_that_was_asked_for_wrongly_is_refused_with_the_right_one(tmp_pat
     job, _ = capture_of(tmp_path, FISHEYE)
     job = dataclasses.replace(job, groups=(dataclasses.replace(job.groups[0], model="OPENCV"),))
     with pytest.raises(SfmError, match="OPENCV does not fit camera 1") as caught:
-        fallbacks.build_model(job, Reporter(io.BytesIO()), deadline=float("inf"))
+        fallbacks.build_model(job, Reporter(io.BytesIO()))
     assert "recon sfm --camera-model OPENCV_FISHEYE" in caught.value.message
     kept = fallbacks.build_model(dataclasses.replace(job, accept_weak=True),
-                                 Reporter(io.BytesIO()), deadline=float("inf"))
+                                 Reporter(io.BytesIO()))
     assert kept.broken == ()
     assert kept.parts[0].registered == job.names
 

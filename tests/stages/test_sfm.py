@@ -235,13 +235,27 @@ def test_a_run_killed_in_every_step_ends_with_the_bytes_of_one_that_was_not(
         path.name for path in uninterrupted.iterdir())
 
 
-@pytest.mark.integration
-def test_the_model_does_not_depend_on_the_number_of_threads(mapped, room, tmp_path):
+@pytest.mark.slow
+def test_the_model_depends_neither_on_threads_nor_on_what_else_runs(mapped, room, tmp_path):
     other, _, _ = mapped
-    run(room, tmp_path / "out", ctx=StageContext(threads=1), max_features=FEATURES)
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        run(room, tmp_path / "out", ctx=StageContext(threads=1), max_features=FEATURES)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
     for name in MODEL:
         assert (tmp_path / "out" / "sparse" / name).read_bytes() == (
             other / "sparse" / name).read_bytes(), name
+    assert read_pairs(tmp_path / "out") == read_pairs(other)
+
+
+def read_pairs(out):
+    """Matches and their geometry in a database."""
+    with contextlib.closing(sqlite3.connect(out / "database.db")) as connection:
+        return [list(connection.execute(f"SELECT * FROM {table}"))
+                for table in ("matches", "two_view_geometries")]
 
 
 def test_a_finished_run_is_not_done_again(mapped, room):
