@@ -195,7 +195,7 @@ def bridges(monkeypatch):
 
 def build(job):
     stream = io.BytesIO()
-    result = fallbacks.build_model(job, Reporter(stream), deadline=float("inf"))
+    result = fallbacks.build_model(job, Reporter(stream))
     return result, [event for line in stream.getvalue().splitlines()
                     if isinstance(event := parse(line), str)]
 
