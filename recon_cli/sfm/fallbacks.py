@@ -181,8 +181,7 @@ def build_model(job: MappingJob, report: Reporter) -> ModelResult:
             if bridge is not None:
                 ways.insert(0, bridge)
             elif fallback.name == BRIDGE and attempt.registered and attempt.shortfall:
-                ways.insert(0, Fallback(
-                    RELAXED_BRIDGE, "", lambda *_: set(), mapper.map_relaxed))
+                ways.insert(0, Fallback(RELAXED_BRIDGE, "", lambda *_: set(), _map_bridged_again))
             elif any(made.registered and not made.shortfall for made in attempts):
                 break
             reason = attempt.shortfall or "the photos share few matches"
@@ -265,6 +264,15 @@ def _with_bridge(
     thin = best.thin if best else ()
     return Fallback(BRIDGE, "", lambda *_: set(), lambda job, report: (
         bridge.map_bridged(job, report, parts, thin)))
+
+
+def _map_bridged_again(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
+    """Returns the models of the bridged matches with lower thresholds.
+
+    From a copy: COLMAP writes to what it opens, and the finished attempt has digests.
+    """
+    shutil.copyfile(job.attempts / BRIDGE / skeleton.MATCHES_DB, job.database)
+    return mapper.map_relaxed(job, report)
 
 
 def may_bridge(job: MappingJob) -> bool:
@@ -454,7 +462,7 @@ def _publish_best(
 
 def _with_own_matches(job: MappingJob, name: str) -> MappingJob:
     """Returns a job that maps from the database of an attempt that has its own."""
-    own = job.attempts / (BRIDGE if name == RELAXED_BRIDGE else name) / skeleton.MATCHES_DB
+    own = job.attempts / name / skeleton.MATCHES_DB
     has_own = name in (TRACKS, BRIDGE, RELAXED_BRIDGE, wide_lens.ATTEMPT, wide_lens.OTHER) or (
         name == SEGMENTS and job.tracks is not None)
     return dataclasses.replace(job, matches_db=own) if has_own else job

@@ -195,7 +195,7 @@ def bridges(monkeypatch):
 
 def build(job):
     stream = io.BytesIO()
-    result = fallbacks.build_model(job, Reporter(stream), deadline=float("inf"))
+    result = fallbacks.build_model(job, Reporter(stream))
     return result, [event for line in stream.getvalue().splitlines()
                     if isinstance(event := parse(line), str)]
 
@@ -250,16 +250,22 @@ def test_bridges_that_place_too_few_are_mapped_again_with_lower_thresholds(
 
     def relaxed(job, report):
         databases.append(job.database)
-        return real(job, report)
+        models = real(job, report)
+        if len(databases) == 1:
+            raise KeyboardInterrupt
+        return models
 
     monkeypatch.setattr(mapper, "map_relaxed", relaxed)
     find = mapper.map_incrementally
     monkeypatch.setattr(mapper, "map_incrementally", lambda job, report: (
         [part(truth, job.names[:12])] if job.matches_db else find(job, report)))
+    with pytest.raises(KeyboardInterrupt):
+        build(job)
+    assert StepLog(job.attempts).find_damage() is None
     result, _ = build(job)
     assert [(item.name, item.registered) for item in result.attempts] == [
         ("exhaustive", 10), ("bridge", 12), ("bridge relaxed", 20)]
-    assert databases == [job.attempts / "bridge" / "linked.db"]
+    assert databases == [job.attempts / "bridge relaxed" / "linked.db"] * 2
     assert sum(item.kept for item in result.attempts) == 1
     assert result.attempts[2].kept
 
