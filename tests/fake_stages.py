@@ -21,7 +21,7 @@ from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
-from recon_cli.stages import STAGES
+from recon_cli.stages import STAGES, Stage
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import JsonRecord
@@ -35,11 +35,15 @@ class FakeSummary(JsonRecord):
     length: float
     names: tuple[str, ...]
     planned_iterations: int | None = None  # of train
+    file: str | None = None  # of a part
 
 
-TABLE = tuple(
-    dataclasses.replace(row, module="fake_stages", summary=FakeSummary, own_digests=False)
-    for row in STAGES)
+def _fake(row: Stage) -> Stage:
+    return dataclasses.replace(row, module="fake_stages", summary=FakeSummary, own_digests=False,
+                               parts=tuple(map(_fake, row.parts)))
+
+
+TABLE = tuple(map(_fake, STAGES))
 NAMES = [row.name for row in TABLE]
 STEPS = 6
 DEFAULT_LENGTH = 3000  # iterations of train where none are asked for
@@ -55,8 +59,9 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     ran.append(name)
     seen[name] = inputs
     actions.get(name, lambda: None)()
+    own = f"{inputs.part}-" * bool(inputs.part)  # parts share a folder
     for step in range(1, STEPS + 1):
-        path = out / f"step{step}.txt"
+        path = out / f"{own}step{step}.txt"
         if not path.exists():
             write_bytes(path, f"{step} of {name}".encode())
             ctx.record(step, STEPS)
@@ -67,14 +72,14 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     read += [path.read_text() for path in inputs.sources if path.is_file()]
     read += [(inputs.continues / "result.txt").read_text()] if inputs.continues else []
     result = hashlib.sha256(json.dumps([name, options, read]).encode()).hexdigest()
-    (out / "result.txt").write_text(result)
-    for volatile in next(row.volatile for row in TABLE if row.name == name):
+    (out / f"{own}result.txt").write_text(result)
+    for volatile in next((row.volatile for row in TABLE if row.name == name), ()):
         path = out / volatile.replace("*", "any")
         path.parent.mkdir(exist_ok=True)
         path.write_text(str(time.time_ns()))
-    (out / "table.txt").write_text(f"the table of {name}\n")
+    (out / f"{own}table.txt").write_text(f"the table of {name}\n")
     planned = (getattr(config, "iterations", None) or DEFAULT_LENGTH) if name == "train" else None
-    return FakeSummary(STEPS, 1.5, ("a", "b"), planned)
+    return FakeSummary(STEPS, 1.5, ("a", "b"), planned, f"{own}result.txt" if own else None)
 
 
 def job_at(root: Path, settings: Settings | None = None) -> Job:

@@ -9,8 +9,7 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.ending import end_run, name_workspace
-from recon_cli.commands.jobs import open_job_with, run_stages
+from recon_cli.commands.jobs import end_run, name_workspace, open_job_with, run_stages
 from recon_cli.commands.options import Call, explicit_settings, pass_call, verb
 from recon_cli.commands.view import show_training
 from recon_cli.config.export import ExportConfig

@@ -12,8 +12,9 @@ import re
 import statistics
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -172,7 +173,7 @@ def measure(plan: BenchPlan, progress: Progress) -> dict[str, BackendFigures]:
             for name, renderer in renderers.items():
                 registry.use_threads(name, plan.threads)
                 answer(tiny, renderer)  # compiles
-                memory[name] = measure_memory(lambda r=renderer: answer(scene, r), plan.device)
+                memory[name] = measure_memory(partial(answer, scene, renderer), plan.device)
             truth = answer(replace(
                 scene, splats=scene.splats.map(Tensor.double),
                 background=scene.background.double(), weights=scene.weights.double()), tiles.render)
@@ -187,9 +188,15 @@ def measure(plan: BenchPlan, progress: Progress) -> dict[str, BackendFigures]:
     finally:
         torch.set_num_threads(before[0])
         pool.threads = before[1]
-    return {name: BackendFigures(
-        *map(statistics.median, zip(*samples[name], strict=True)), memory[name],
-        *errors(answer(scene, renderer), truth)) for name, renderer in renderers.items()}
+    return {name: _collect(samples[name], memory[name], errors(answer(scene, renderer), truth))
+            for name, renderer in renderers.items()}
+
+
+def _collect(
+    samples: Sequence[tuple[float, float, float]], memory: int, error: tuple[float, float, float]
+) -> BackendFigures:
+    forward, backward, step = map(statistics.median, zip(*samples, strict=True))
+    return BackendFigures(forward, backward, step, memory, *error)
 
 
 def _time(

@@ -202,8 +202,10 @@ class Workspace:
         partial = self.partial(stage)
         if shared_folder.is_shared(stage):
             shared_folder.move_in(partial, self.folder(stage))
-            remove(partial)
             sync_folder(self.folder(stage))
+            self._old(stage).parent.mkdir(exist_ok=True)
+            remove(self._old(stage))
+            move(partial, self._old(stage))
         else:
             self._retire(stage)
             move(partial, self.folder(stage))

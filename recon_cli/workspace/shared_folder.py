@@ -42,9 +42,13 @@ def find_damage(partial: Path, folder: Path) -> list[str]:
 
 
 def move_in(partial: Path, folder: Path) -> None:
-    """Moves a finished result with its manifest into the folder, in place of its last one."""
+    """Moves a finished result into the folder, in place of its last one; its manifest comes last.
+
+    `partial` keeps its manifest: what was begun by a run that was killed is done again.
+    """
     name = manifest_name(partial.name)
-    outputs, known = Manifest.read(partial, name).outputs, _read_all(folder)
+    finished, known = Manifest.read(partial, name), _read_all(folder)
+    outputs = finished.outputs
     if name == NAME and name in known:
         known |= _split(folder, known[name])
     last = known.pop(name).outputs if name in known else {}
@@ -58,7 +62,7 @@ def move_in(partial: Path, folder: Path) -> None:
     _remove_outputs(folder, last, [outputs, *others])
     for path in _find_strangers(folder, partial.name, [outputs, *others]):
         _set_aside(folder / path)
-    _put(partial / name, folder / name)
+    finished.write(folder)
 
 
 def result_paths(folder: Path, stage: str) -> list[Path]:

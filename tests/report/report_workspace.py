@@ -102,8 +102,9 @@ def change(path: Path, edit) -> None:
 
 def give_title(workspace: Path, title: str) -> None:
     """Makes the export one that was given a title."""
-    manifest = Manifest.read(workspace / "export")
-    key = replace(manifest.key, config={**manifest.key.config, "title": title})
+    manifest = Manifest.read(workspace / "export", "manifest.spz.json")
+    key = replace(manifest.key, stage="export.html", config={
+        **manifest.key.config, "title": title})
     replace(manifest, key=key).write(workspace / "export")
 
 

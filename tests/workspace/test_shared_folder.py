@@ -20,7 +20,7 @@ from recon_cli.cli import main
 from recon_cli.export import format_writer
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import read_ply, write_ply
-from recon_cli.workspace import durable
+from recon_cli.workspace import durable, layout
 from recon_cli.workspace.digests import digest_file, matches
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, LossLimit
 from recon_cli.workspace.layout import Workspace
@@ -248,21 +248,22 @@ def test_without_a_manifest_that_can_be_read_files_are_kept(ws, name):
 
 
 def stop_at(monkeypatch, place):
-    """Interrupts the next export while it writes, is sealed, or has moved its first files in."""
+    """Interrupts the next export while it writes, is sealed, moves files in, or has done so."""
     def interrupt(*_args, **_options):
         raise KeyboardInterrupt
 
     def interrupt_late(source, target):
-        if source.name.startswith("manifest.") and "export.glb" in source.parts:
+        if (target.parent.name, target.name) == ("export", "manifest.glb.json"):
             raise KeyboardInterrupt
         os.replace(source, target)
 
     where = {"write": (format_writer.FormatWriter, "write", interrupt),
-             "seal": (Workspace, "seal", interrupt), "move": (durable, "replace", interrupt_late)}
+             "seal": (Workspace, "seal", interrupt), "move": (durable, "replace", interrupt_late),
+             "tidy": (layout, "move", interrupt)}
     monkeypatch.setattr(*where[place])
 
 
-@pytest.mark.parametrize("place", ["write", "seal", "move"])
+@pytest.mark.parametrize("place", ["write", "seal", "move", "tidy"])
 def test_an_export_that_is_interrupted_can_be_repeated_and_ends_the_same(
     ws, tmp_path, monkeypatch, place
 ):
