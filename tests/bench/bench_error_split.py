@@ -27,7 +27,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo.depths import places
 from recon_cli.train import moving
-from recon_cli.train.photometry import read_falloffs
+from recon_cli.train.parts.photometry import read_falloffs
 
 CAUSES = ("few views", "moving", "pose", "gain", "tone curve", "blur", "rest")
 _FEW = 3  # training views that a pixel needs to be well seen

@@ -34,13 +34,14 @@ from recon_cli.evaluation.metrics import corrected_psnr, psnr
 from recon_cli.evaluation.reference_views import load_reference_views, render_view
 from recon_cli.io.views import ReferenceView
 from recon_cli.scene.scene import Scene
-from recon_cli.train.exposure import estimate_gains
-from recon_cli.train.feature_trials import TrialScene, examine
+from recon_cli.train.parts.part import TrialScene
+from recon_cli.train.parts.sparse_points import estimate_gains
+from recon_cli.train.parts.trials import examine
+from recon_cli.train.parts.vignette import find_vignettes
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task
-from recon_cli.train.vignette_evidence import find_vignettes
 
 PARTS = ("exposure", "vignette")
 TRIAL_SIZE = 600  # pixels; of `recon train` by default
@@ -94,7 +95,7 @@ def main(workspaces: tuple[Path, ...], chosen: tuple[str, ...], seeds: int, iter
         scene = open_scene(workspace, 0.0)
         base = RunConfig(
             iterations=iterations, max_size=max_size, max_gaussians=max_gaussians, sh_degree=1,
-            images="original", far="on", stereo="off", moving="off", early_stop=False)
+            images="original", background="on", stereo="off", moving="off", early_stop=False)
         task = load_task(scene, base, ctx)
         drift = estimate_gains(task.train, scene.points)
         corners = find_vignettes(task.train, scene.points).corner_loss

@@ -36,7 +36,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
 from recon_cli.stereo.depths import places
-from recon_cli.train.moving_masks import FOLDER, file_name
+from recon_cli.train.masks import FOLDER, file_name
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace.summaries import TrainPlan
 
@@ -272,7 +272,7 @@ def main(
     workbench.numba_context()
     scene, splats = open_scene(folder)
     config = TrainConfig(
-        iterations=iterations, max_size=max_size, sh_degree=1, far="off", exposure="off",
+        iterations=iterations, max_size=max_size, sh_degree=1, background="off", exposure="off",
         stereo="off", validation=0.0, moving="off")
     if (out / "clean/splats.ply").exists():
         clean, seconds = read_ply(out / "clean/splats.ply"), 0.0

@@ -14,7 +14,7 @@ from recon_cli.experiments.bench_scene import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
 from recon_cli.render.triton import step as triton_step
 from recon_cli.render.triton.step_status import StepReport
-from recon_cli.train import async_trainer
+from recon_cli.train import stepper
 
 _IMAGE, _GRADIENT = 1e-5, 1e-3  # greatest rms of a picture, relative error of a gradient
 _STEPS = 20  # half of them before a densification
@@ -132,7 +132,7 @@ def waiting(figures: Figures, size: SceneSize) -> None:
     state, task = training(size, figures.device, still=True)
     for start in (GATHERING, AFTER):
         state.iteration = start
-        steps = async_trainer.AsyncTrainer(state, task, lambda _: False)
+        steps = stepper.AsyncStepper(state, task, lambda _: False)
         steps._start()  # compiles
         torch.cuda.synchronize()
         found = f"{_FREE} steps from {start:,} on, recordings among them"

@@ -21,7 +21,7 @@ from recon_cli.render.triton import step as triton_step
 from recon_cli.render.triton.step_status import StepReport
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train import async_trainer
+from recon_cli.train import stepper
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, new_state
 from recon_cli.train.task import Task
@@ -78,7 +78,7 @@ def stretch(
     state: TrainState, task: Task, start: int, steps: int
 ) -> Callable[[], None]:
     """Returns a function that takes the steps after `start`, as `recon train` does, and waits."""
-    advance = async_trainer.choose_trainer(state, task, None, lambda now: now == start + steps)
+    advance = stepper.choose_stepper(state, task, None, lambda now: now == start + steps)
 
     def take() -> None:
         state.iteration = start

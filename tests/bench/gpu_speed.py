@@ -14,7 +14,7 @@ from torch import Tensor
 
 from recon_cli.experiments.bench_scene import BenchScene, SceneSize, build_scene
 from recon_cli.render import render
-from recon_cli.train import async_trainer
+from recon_cli.train import stepper
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
 
@@ -143,7 +143,7 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int = _STRETCH)
 def _started(state: TrainState, task: Task) -> float:
     """Returns the milliseconds in which the host starts a step that was recorded before."""
     state.iteration = GATHERING
-    trainer = async_trainer.AsyncTrainer(state, task, lambda _: False)
+    trainer = stepper.AsyncStepper(state, task, lambda _: False)
     for _ in range(_RECORDED):
         trainer._start()
     torch.cuda.synchronize()
