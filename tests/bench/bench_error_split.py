@@ -25,7 +25,7 @@ from recon_cli.evaluation.reference_views import load_reference_views, render_vi
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import places
+from recon_cli.stereo.depths import unproject
 from recon_cli.train import moving
 from recon_cli.train.parts.photometry import read_falloffs
 
@@ -56,7 +56,7 @@ def count_witnesses(
 ) -> NDArray[np.int64]:
     """Returns how many of `views` see the surface in each pixel [H, W] of another view."""
     pixels = np.flatnonzero(own.depth.reshape(-1) > 0)
-    where = places(own.camera, own.depth, pixels)
+    where = unproject(own.camera, own.depth, pixels)
     count = np.zeros(own.depth.size, np.int64)
     for other in views:
         count[pixels] += moving.sees(other, where)

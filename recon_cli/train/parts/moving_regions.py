@@ -20,7 +20,7 @@ from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import places
+from recon_cli.stereo.depths import unproject
 
 SIDE = 150  # pixels of the longer side of the views that are compared
 _OTHERS = 14  # views that each is compared with, spread over all that show the same
@@ -101,7 +101,7 @@ def find_overlapping(
     pixels = _grid(own.depth)
     if not len(pixels):
         return np.empty(0, np.int64)
-    where = places(own.camera, own.depth, pixels)
+    where = unproject(own.camera, own.depth, pixels)
     shares = np.array([0.0 if other is own else float(np.mean(sees(other, where)))
                        for other in views])
     good = np.flatnonzero(shares >= _SHARED)
@@ -162,7 +162,7 @@ def contradict(
     if not len(pixels) or not len(others):
         return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
                              witnesses.reshape(height, width))
-    where = places(own.camera, own.depth, pixels)
+    where = unproject(own.camera, own.depth, pixels)
     errors = np.full((len(others), len(pixels), 3), np.inf, np.float32)
     for row, index in zip(errors, others, strict=True):
         other = views[index]
@@ -295,7 +295,7 @@ def _common(
 ) -> float:
     """Returns in what share of the other views of its surface a part of a view is in a region."""
     pixels = np.flatnonzero(part.reshape(-1) & (own.depth.reshape(-1) > 0))
-    where = places(own.camera, own.depth, pixels)
+    where = unproject(own.camera, own.depth, pixels)
     seen = inside = 0
     for index in others:
         other = views[index]

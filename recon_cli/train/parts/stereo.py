@@ -18,7 +18,7 @@ from recon_cli.deadline import Deadline
 from recon_cli.io.images import reduce_to
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import StereoView, find_depths, find_partners, places
+from recon_cli.stereo.depths import StereoView, find_depths, find_partners, unproject
 from recon_cli.train.parts.part import Part, Sign, Start
 from recon_cli.train.parts.sparse_points import estimate_gains
 from recon_cli.train.task import Evidence, Task
@@ -125,7 +125,7 @@ def _merge(
     parts = []
     for view, depth in zip(views, depths, strict=True):
         pixels = np.flatnonzero(depth > 0)
-        where = places(view.camera, depth, pixels)
+        where = unproject(view.camera, depth, pixels)
         cells, inverse = np.unique(_cells(where, side), return_inverse=True)
         values = np.column_stack([where, view.image.reshape(-1, 3)[pixels], np.ones(len(pixels))])
         sums = np.stack([np.bincount(inverse, column, len(cells)) for column in values.T], axis=1)
