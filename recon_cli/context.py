@@ -27,8 +27,8 @@ class TrainReport:
     gaussians: int  # count
     seconds: float  # of this call, so far
     cpu_seconds: float = 0.0  # of all threads of this process in this call, so far
-    # the iteration to which the run jumps now; None where it just continues
-    goes_on_at: int | None = None
+    # to which the run skips now; None where it just continues
+    skip_to_iteration: int | None = None
 
 
 class TrainCallback:

@@ -33,8 +33,9 @@ DENOISE = DenoiseSummary(
 TRAIN = TrainSummary(
     iterations=100, gaussians=50, initial_gaussians=20, max_gaussians=60, max_size=48,
     planned_iterations=100, stopped_early_at=None, training_views=9, validation_views=0, width=48,
-    height=36, validation_psnr_db=None, train_seconds=1.5, parts={"far": "off", "sh_degree": 0},
-    skipped_steps=0, estimated_seconds=2.0, calibration_seconds=0.5, cuda_peak_bytes=0)
+    height=36, validation_psnr_db=None, train_seconds=1.5,
+    parts={"background": "off", "sh_degree": 0}, skipped_steps=0, estimated_seconds=2.0,
+    calibration_seconds=0.5, cuda_peak_bytes=0)
 PRUNE = PruneSummary(
     at="end", score="loo", ratio=0.5, gaussians_before=50, gaussians=25,
     validation_psnr_db_pruned=None,

@@ -183,3 +183,33 @@ def test_no_part_is_forgotten_and_no_rule_is_circular() -> None:
         free = {name for name, below in left.items() if not below & left.keys()}
         assert free, f"circular among {sorted(left)}"
         left = {name: below for name, below in left.items() if name not in free}
+
+
+# Parts of training whose options are words of their own: what names the option, or imports the
+# module, knows the part.
+PARTS_OF_TRAINING = ("background", "stereo", "exposure", "vignette", "depth", "moving")
+MAX_FILES_OF_A_PART = 4
+
+
+def names_part(path: Path, name: str) -> bool:
+    """Returns whether a file reads, sets or declares the option of a part, or imports its module.
+
+    A part has the folder or module of its name below train/parts.
+    """
+    module = ("train", "parts", name)
+    if any(names[:3] == module for names in inside(path)):
+        return True
+    reads = {dotted(node) for node in nodes(path, ast.Attribute)}
+    if any(read.endswith((f"config.{name}", f"asked.{name}")) for read in reads):
+        return True
+    return any(word.arg == name for call in nodes(path, ast.Call) for word in call.keywords
+               if dotted(call.func).rsplit(".", 1)[-1] in {"RunConfig", "TrainConfig", "Part"})
+
+
+def test_few_files_know_a_part_of_training() -> None:
+    for name in PARTS_OF_TRAINING:
+        own = {path for path in FILES if path.stem.startswith(name) and path.parent.name == "parts"}
+        others = {path for path in FILES if names_part(path, name)} - own
+        assert own
+        declares = PACKAGE / "config" / "stages.py"
+        assert len(others | {declares}) + 1 <= MAX_FILES_OF_A_PART, (name, others)

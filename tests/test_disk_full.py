@@ -33,7 +33,7 @@ min_registered = 0.3
 iterations = 20
 max_size = 64
 max_gaussians = 2000
-far = "off"
+background = "off"
 stereo = "off"
 checkpoint_every = 5
 """

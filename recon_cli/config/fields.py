@@ -34,6 +34,9 @@ class OptionInfo:
     # fresh
     late: bool = False
     expert: bool = False  # --help leaves it to --help-all
+    plain: Any = None  # the value that does without, of an optional part of the model
+    formerly: str = ""  # its name in files of earlier versions
+    old_words: Mapping[str, Any] = field(default_factory=dict)  # what values were called then
     # help of each choice that gets a flag of its own in place of one option: --force
     flags: Mapping[str, str] = field(default_factory=dict)
     automatic: str = ""  # what None means
@@ -142,6 +145,24 @@ class StageConfig:
     def late_fields(cls) -> tuple[str, ...]:
         """Returns the fields that the fingerprint leaves out at their default."""
         return tuple(item.name for item in dataclasses.fields(cls) if option_info(item).late)
+
+    @classmethod
+    def rename(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns values that an earlier version may have written, by the names of now."""
+        infos = {option_info(item).formerly or item.name: (item.name, option_info(item).old_words)
+                 for item in dataclasses.fields(cls)}
+        renamed = {}
+        for name, value in values.items():
+            now, words = infos.get(name, (name, {}))
+            renamed[now] = words.get(value, value) if isinstance(value, str) else value
+        return renamed
+
+    @classmethod
+    def plain_values(cls, *, late: bool = True) -> dict[str, Any]:
+        """Returns the values of a model without optional parts, `late` options included or not."""
+        infos = {item.name: option_info(item) for item in dataclasses.fields(cls)}
+        return {name: info.plain for name, info in infos.items()
+                if info.plain is not None and (late or not info.late)}
 
     @classmethod
     def refuse_contradictions(cls, values: Mapping[str, Any]) -> None:

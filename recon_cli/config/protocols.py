@@ -29,6 +29,7 @@ class Protocol:
     # Schedules count by STEPS, whatever number is asked for: 7,000 steps are the first 7,000 of
     # 30,000, as in the tables of 3DGS and after it.
     whole_schedule: bool = False
+    plain: bool = False  # without optional parts of the model
     limits_count: bool = True  # --max-gaussians has a default; else memory is the limit
 
 
@@ -37,9 +38,9 @@ _SPLIT = {"validation": 0.0, "early_stop": False, "blocks": "off"}
 PROTOCOLS = {protocol.name: protocol for protocol in (
     Protocol(
         "3dgs", "3DGS as published: INRIA's densification, rates, loss and schedule, degree 3",
-        {**_SPLIT, "densify": "reference", "sh_degree": 3, "images": "original", "far": "off",
-         "stereo": "off", "exposure": "off", "max_radius": 0.0},
-        whole_schedule=True, limits_count=False),
+        {**_SPLIT, "densify": "reference", "sh_degree": 3, "images": "original",
+         "max_radius": 0.0},
+        whole_schedule=True, plain=True, limits_count=False),
     Protocol("recon", "the recipe of recon, on the same views", _SPLIT))}
 SPLIT_WORDS = "every 8th view by name held out, no validation views"
 
@@ -63,7 +64,12 @@ def fixed_options(config: StageConfig) -> dict[str, Any]:
         item.name: values[item.name] for item in dataclasses.fields(config)
         if values[item.name] != item.default})
     steps = STEPS if values["iterations"] is None else values["iterations"]
-    return {**protocol.options, "iterations": steps}
+    return {**_options(protocol, type(config)), "iterations": steps}
+
+
+def _options(protocol: Protocol, config: type[StageConfig]) -> dict[str, Any]:
+    """Returns all options that a protocol sets; later ones are off by themselves without trials."""
+    return {**protocol.options, **(config.plain_values(late=False) if protocol.plain else {})}
 
 
 def refuse_contradictions(config: type[StageConfig], values: Mapping[str, Any]) -> None:
@@ -71,8 +77,9 @@ def refuse_contradictions(config: type[StageConfig], values: Mapping[str, Any]) 
     protocol = follow(values.get("protocol"))
     if protocol is None:
         return
+    options = _options(protocol, config)
     for item in dataclasses.fields(config):
-        fixed = protocol.options.get(item.name, item.default)
+        fixed = options.get(item.name, item.default)
         value = values.get(item.name, fixed)
         if value == fixed or item.name in FREE or not option_info(item).hashed:
             continue

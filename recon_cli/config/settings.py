@@ -44,7 +44,7 @@ SECTIONS: dict[str, type[StageConfig]] = {
 GONE: dict[str, dict[str, tuple[Any, ...]]] = {
     "denoise": {"filter": ("bilateral",)},
     "train": {"poses": ("auto", "off"), "densify_scale": (0.01,), "tone": ("off",),
-              "blur": ("auto", "off"), "shutter": ()},
+              "blur": ("auto", "off"), "shutter": (), "far": (), "look": ()},
     "merge": {"validation": (0.05,)},
     "prune": {"sweep": (), "ratios": ()},
     "evaluate": {"seeds": ()},
@@ -54,7 +54,9 @@ GONE: dict[str, dict[str, tuple[Any, ...]]] = {
 SUCCESSORS = {
     ("export", "drop_backdrop"): "Give --backdrop drop, in a file backdrop = 'drop'.",
     ("prune", "sweep"): "Run `recon prune --again --score NAME --ratio X` for each.",
-    ("evaluate", "seeds"): "`recon study --scenes WORKSPACE --seeds N` trains with N seeds."}
+    ("evaluate", "seeds"): "`recon study --scenes WORKSPACE --seeds N` trains with N seeds.",
+    ("train", "far"): "Give --background, in a file background.",
+    ("train", "look"): "Give --brightness filmed or even, in a file brightness."}
 FILE = "recon.toml"  # in the workspace
 Settings = dict[str, dict[str, Any]]  # section -> field -> value, explicit ones only
 C = TypeVar("C", bound=StageConfig)
@@ -74,7 +76,10 @@ def read_settings(path: Path) -> Settings:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
         raise ConfigError(
             f"{path} is not valid TOML: {reason}.", hint=f"Fix {path.name}.") from error
-    settings = _drop_gone(settings)
+    settings = _drop_gone({
+        section: SECTIONS[section].rename(values)
+        if section in SECTIONS and isinstance(values, dict) else values
+        for section, values in settings.items()})
     for section, values in settings.items():
         check_names(section, (), where=str(path))
         if not isinstance(values, dict):

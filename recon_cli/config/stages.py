@@ -208,29 +208,29 @@ class TrainConfig(StageConfig):
     images: str = option(
         "auto", "Pixels to use; auto: by a trial.",
         choices=("auto", "denoised", "original"))
-    far: str = option(
+    background: str = option(
         "auto", "Add background Gaussians where there are no sparse points; auto: by a trial.",
-        choices=("auto", "on", "off"))
+        choices=("auto", "on", "off"), plain="off", formerly="far")
     stereo: str = option(
         "auto", "Start with Gaussians on surfaces that dense stereo finds and sparse points leave "
         "out; auto: on.",
-        choices=("auto", "on", "off"), expert=True)
+        choices=("auto", "on", "off"), plain="off", expert=True)
     exposure: str = option(
         "auto", "A gain per image; auto: by trial.",
-        choices=("auto", "on", "off"))
+        choices=("auto", "on", "off"), plain="off")
     vignette: str = option(
         "auto", "The falloff of each camera's lens towards the corners; auto: by a trial.",
-        choices=("auto", "on", "off"), late=True, expert=True)
+        choices=("auto", "on", "off"), plain="off", late=True, expert=True)
     depth: str = option(
         "auto", "Compare rendered depth with that of a sensor, where it is sure; auto: with "
         "budget, unless a trial shows a loss.",
-        choices=("auto", "on", "off"), late=True, expert=True)
+        choices=("auto", "on", "off"), plain="off", late=True, expert=True)
     moving: str = option(
         "auto", "Mask people and things that move; auto: where views contradict the others.",
         choices=("auto", "on", "off"), late=True, expert=True)
-    look: str = option(
-        "walk", "Brightness: as filmed, or even.", choices=("walk", "even"),
-        late=True)
+    brightness: str = option(
+        "filmed", "Brightness: as filmed, or even.", choices=("filmed", "even"), late=True,
+        formerly="look", old_words={"walk": "filmed"})
     validation: float = option(0.05, _VALIDATION, minimum=0.0, maximum=0.5)
     ssim_weight: float = option(
         0.2, "Weight of 1 - SSIM in the loss; the rest is L1.", minimum=0.0, maximum=1.0,
@@ -319,14 +319,20 @@ class RunConfig(SettledConfig):
     max_gaussians: int = option(60_000, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS)
 
     @property
+    def has_gains(self) -> bool:
+        """Whether each training image has a gain of its own."""
+        return self.exposure == "on"
+
+    @property
     def is_reference(self) -> bool:
         """Whether this is the recipe of 3DGS (Kerbl et al. 2023), with any steps and images."""
         fixed = ("batch_views", "sh_degree", "ssim_weight", "densify_every", "densify_gradient",
                  "min_opacity", "means_rate", "quats_rate", "scales_rate", "opacities_rate",
                  "sh_rate")
-        return self.densify == "reference" and (
-            "on" not in (self.depth, self.vignette)) and all(
-            getattr(self, part) == "off" for part in ("far", "stereo", "exposure")) and (
+        plain = self.plain_values()  # an option that came later is automatic in older records
+        return self.densify == "reference" and all(
+            getattr(self, name) in (plain[name], "auto" if name in self.late_fields() else None)
+            for name in plain) and (
             all(getattr(self, name) == getattr(RunConfig, name) for name in fixed))
 
 

@@ -34,6 +34,7 @@ from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import stage
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
+from recon_cli.train.parts.table import model_parts
 from recon_cli.train.plan import first_count
 from recon_cli.train.prune_loop import RATIO, PruneRun, prune_loop, remaining, rounds_within
 from recon_cli.train.schedule import RecoverySchedule
@@ -309,8 +310,7 @@ class Runner:
         points = run_trial(loaded, run, score_at, on_step=on_step)
         config = loaded.task(run).schedule.config
         parts = [f"{config.images} images", f"degree {config.sh_degree}",
-                 *(name for name in ("far", "stereo", "exposure", "vignette", "depth")
-                   if getattr(config, name) == "on")]
+                 *(name for name, value in model_parts(config).items() if value == "on")]
         record = Record(points, self._machine, ", ".join(parts))
         if self._records:
             self._records.add_run(key_of(loaded, run), record, run, loaded.folders.name)

@@ -23,7 +23,7 @@ from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.progress import Progress
 from recon_cli.scene.scene import Scene
-from recon_cli.train.feature_trials import PARTS, model_parts
+from recon_cli.train.parts.table import PARTS, model_parts
 from recon_cli.train.plan import choose_parts
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
@@ -128,7 +128,7 @@ class ExperimentScene:
     def task(self, run: TrainingRun) -> Task:
         """Returns the task of a run, without validation views: training uses only what it fits."""
         config = run.config
-        undecided = [name for name in PARTS if getattr(config, name) == "auto"]
+        undecided = [part.name for part in PARTS if getattr(config, part.name) == "auto"]
         undecided += ["sh_degree"] if run.variant.tries_degree else []
         if undecided:  # `parts` may take trials
             config = dataclasses.replace(config, **{name: self.parts[name] for name in undecided})

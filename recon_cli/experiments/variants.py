@@ -67,8 +67,7 @@ _PAPER_PRUNE = MidPrune(
     2 / 3, PruneConfig(ratio=0.6, score="paper", at="mid", rounds=1), restarts=False)
 
 # 3DGS has no optional parts; the training images are chosen for all variants alike
-_PLAIN = {"densify": "reference", "far": "off", "stereo": "off", "exposure": "off",
-          "depth": "off", "max_radius": 0.0}
+_PLAIN = {**RunConfig.plain_values(), "densify": "reference", "max_radius": 0.0}
 REFERENCE = Variant("reference", "3DGS", _PLAIN)
 PAPER = Variant("paper", "paper", _PLAIN, _PAPER_PRUNE)
 BUDGET = Variant("budget", "ours", {"densify": "budget"}, tries_degree=True)

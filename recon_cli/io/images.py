@@ -152,6 +152,11 @@ def fit_image(rgb: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def reduce_to(view: TrainView, side: int) -> TrainView:
+    """Returns a view whose longer side has at most so many pixels, as `reduce_view`."""
+    return reduce_view(view, max(1.0, max(view.camera.width, view.camera.height) / side))
+
+
 def reduce_view(view: TrainView, factor: float) -> TrainView:
     """Returns a view and its camera reduced by area; unchanged where it would be too small."""
     camera = view.camera

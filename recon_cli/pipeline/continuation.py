@@ -137,7 +137,8 @@ def _obstacles(
     workspace: Workspace, row: Stage, key: ResultKey, finished: Manifest
 ) -> list[str]:
     """Returns in words why a run of `key` does not prolong a finished one."""
-    keys, late = (_without_length(finished.key), _without_length(key)), row.config.late_fields()
+    known = dataclasses.replace(finished.key, config=row.config.rename(finished.key.config))
+    keys, late = (_without_length(known), _without_length(key)), row.config.late_fields()
     reasons = version_differences(*keys, section=row.name, late=late)
     reasons += differences(*keys, section=row.name, late=late)
     reasons += find_changed_outputs(

@@ -163,7 +163,7 @@ class WorkspaceCheck:
         """Returns the known options that a result was made with, overlaid by the settings."""
         names = {item.name for item in dataclasses.fields(row.config)} if key else set()
         stored = {
-            name: value for name, value in (key.config.items() if key else ())
+            name: value for name, value in row.config.rename(key.config if key else {}).items()
             if name in names and _accepts(row.config, name, value)}
         try:
             return layers.build(row.config, layers.merge(
@@ -204,9 +204,11 @@ class WorkspaceCheck:
             if check.usable and not check.fresh]
         newer = manifest.key.version > row.version or any(
             check.state == "newer" for check in needs)
-        keys = manifest.key, self._current_key(row, config, manifest.key, sources)
+        stored = dataclasses.replace(
+            manifest.key, config=row.config.rename(manifest.key.config))
+        keys = stored, self._current_key(row, config, stored, sources)
         section, late = layers.section_of(row.config), row.config.late_fields()
-        gone_values = {name: value for name, value in manifest.key.config.items()
+        gone_values = {name: value for name, value in stored.config.items()
                        if name in keys[1].config and not _accepts(row.config, name, value)}
         version_reasons += [f"{section}.{name} no longer takes {str(value)[:40]}"
                             for name, value in gone_values.items()]

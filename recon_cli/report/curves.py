@@ -44,8 +44,8 @@ def draw_training_curves(stages: StageReports, metrics: Metrics | None) -> Train
             except FormatError as error:
                 damaged.append(f"The log of {name} is not shown: {error.message}")
         notes += [f"Validation PSNR stopped improving: {label} jumped from step {row.iteration:,} "
-                  f"to step {row.goes_on_at:,} of the schedule."
-                  for row in logs.get(name, ()) if row.goes_on_at is not None]
+                  f"to step {row.skip_to_iteration:,} of the schedule."
+                  for row in logs.get(name, ()) if row.skip_to_iteration is not None]
 
     def series(value: Callable[[LogRow], float | None], *, over: str = "iteration") -> list[Series]:
         return [Series(

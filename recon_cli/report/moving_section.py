@@ -12,7 +12,7 @@ from recon_cli.errors import FormatError
 from recon_cli.io.images import fit_image, read_mask, read_png
 from recon_cli.report.gallery import data_uri
 from recon_cli.report.stage_status import StageReports
-from recon_cli.train.moving_masks import FOLDER, read_summary
+from recon_cli.train.masks import FOLDER, read_summary
 
 _PICTURES = 8
 _SIDE, _QUALITY = 360, 72  # pixels of the longer side; of WebP

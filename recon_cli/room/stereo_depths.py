@@ -15,7 +15,7 @@ from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.gravity import find_gravity
-from recon_cli.stereo.depths import Levels, StereoView, find_depths, find_partners, places
+from recon_cli.stereo.depths import Levels, StereoView, find_depths, find_partners, unproject
 
 _SIDE = 600  # pixels of the longer side at most
 _MOST_VIEWS = 150  # that get a depth map, evenly spread; about 2 CPU seconds each
@@ -91,5 +91,5 @@ def surface_points(
     for camera, depth in zip(cameras, depths, strict=True):
         at = np.flatnonzero(depth > 0)
         at = at[np.linspace(0, len(at) - 1, min(count, len(at))).astype(int)]
-        found.append(places(camera, depth, at))
+        found.append(unproject(camera, depth, at))
     return np.concatenate(found)

@@ -57,10 +57,9 @@ from recon_cli.io.views import ReferenceView, evenly_spread, size_summary, sizes
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
-from recon_cli.train.moving import SIDE
-from recon_cli.train.moving_masks import read_summary, with_masks
-from recon_cli.train.moving_search import FINER, Judge, find_in_held_out
-from recon_cli.train.photometry import read_falloffs
+from recon_cli.train.masks import read_summary, with_masks
+from recon_cli.train.parts.moving import FINER, SIDE, ViewComparer, find_in_held_out
+from recon_cli.train.parts.photometry import read_falloffs
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config
 from recon_cli.trust.assess import TrustTask, assess
@@ -96,7 +95,7 @@ class _Evaluation:
     @property
     def gains(self) -> bool:
         """Whether training had a gain for each view."""
-        return self.config.exposure == "on"
+        return self.config.has_gains
 
     def open(self, model: str, *, room: int) -> RenderedModel:
         """Reads one model; it keeps so many bytes of images that `score` renders."""
@@ -263,7 +262,8 @@ def _find_moving(
     splats = read_ply(train / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
     training = load_reference_views(
         with_masks(scene, train).train, FINER * SIDE, threads=ctx.threads)
-    regions = find_in_held_out(splats, held_out, training, Judge(config.sh_degree, ctx.backend))
+    regions = find_in_held_out(
+        splats, held_out, training, ViewComparer(config.sh_degree, ctx.backend))
     return {view.name: region for view, region in zip(held_out, regions, strict=True)
             if region.any() and leaves_enough(~region)}
 

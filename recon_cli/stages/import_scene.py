@@ -84,8 +84,8 @@ def _equivalent_run_config(config: ImportConfig, splats: Splats) -> RunConfig:
     """Returns the options of a training that would have ended with this scene."""
     return RunConfig(
         max_size=config.max_size, validation=config.validation, sh_degree=splats.sh_degree,
-        max_gaussians=max(MIN_GAUSSIANS, len(splats)), images="original", far="off",
-        stereo="off", exposure="off")
+        max_gaussians=max(MIN_GAUSSIANS, len(splats)), images="original",
+        **RunConfig.plain_values(late=False))
 
 
 def _describe(path: Path, scene: LoadedScene, alignment: Alignment | None) -> list[str]:

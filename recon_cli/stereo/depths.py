@@ -150,7 +150,7 @@ def find_partners(
     return partners
 
 
-def places(
+def unproject(
     camera: Camera, depth: NDArray[np.float32], pixels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Returns where some pixels of a depth map [H, W] lie, [N, 3] in world units."""

@@ -38,7 +38,7 @@ from recon_cli.scene.covisibility import (
     views_of_block,
 )
 from recon_cli.scene.scene import Scene
-from recon_cli.train.moving_masks import with_masks
+from recon_cli.train.masks import with_masks
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import digest_outputs, sha256_json

@@ -19,8 +19,8 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
 from recon_cli.scene.splats import with_rows
 from recon_cli.splats.ply import read_ply
-from recon_cli.train.feature_trials import PARTS, model_parts
 from recon_cli.train.initialize import begin_state, restore_state
+from recon_cli.train.parts.table import PARTS, model_parts
 from recon_cli.train.runner import LOG
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import DensificationStats, TrainState, read_progress
@@ -77,20 +77,19 @@ class FinishedModel:
         """
         if self.trained:
             return model_parts(self.config)
-        for name in ("far", "stereo"):
-            if getattr(asked, name) == "on":
+        for part in PARTS:
+            if part.attach and part.is_on(asked):
                 raise ConfigError(
-                    f"{name} is on, but an imported scene keeps its Gaussians: others are "
-                    "only added to the points of sfm.", hint=f"Leave out --{name}.")
+                    f"{part.name} is on, but an imported scene keeps its Gaussians: others are "
+                    "only added to the points of sfm.", hint=f"Leave out --{part.name}.")
         if asked.max_gaussians is not None and asked.max_gaussians < self.gaussians:
             raise ConfigError(
                 f"max_gaussians is {asked.max_gaussians:,}, but the imported scene has "
                 f"{self.gaussians:,} Gaussians.",
                 hint="Leave out --max-gaussians, and let `recon prune` lower the count.")
         own = model_parts(self.config)
-        given = {name: getattr(asked, name) for name in (*PARTS, "sh_degree")}
         return {name: own[name] if value in (None, "auto") else value
-                for name, value in given.items()}
+                for name, value in model_parts(asked).items()}
 
     def write_inherited_files(self, schedule: Schedule, out: Path, ctx: StageContext) -> None:
         """Writes the inherited files into the result's folder, and tells the user of the start."""
@@ -122,7 +121,7 @@ class FinishedModel:
             return begin_state(splats, task)
         state = restore_state(self.folder / FINAL, task)
         state.iteration = state.steps
-        state.jump, state.looks = None, []  # it may stop early again, by looks of its own
+        state.skipped_phase, state.validation_history = None, []  # it may stop early again
         state.gathered = DensificationStats.zeros(len(state.splats), task.device)
         state.first_count = len(state.splats)
         return state
@@ -132,8 +131,8 @@ def _renumbered(rows: tuple[LogRow, ...]) -> bytes:
     """Returns the lines of a log that counts the steps taken, also after an early stop."""
     lines, skipped = [], 0
     for row in rows:
-        own = dataclasses.replace(row, iteration=row.iteration - skipped, goes_on_at=None)
+        own = dataclasses.replace(row, iteration=row.iteration - skipped, skip_to_iteration=None)
         lines.append(json.dumps(own.to_json()) + "\n")
-        if row.goes_on_at is not None:
-            skipped += row.goes_on_at - row.iteration
+        if row.skip_to_iteration is not None:
+            skipped += row.skip_to_iteration - row.iteration
     return "".join(lines).encode()

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 from recon_cli.context import TrainCallback, TrainReport
 from recon_cli.evaluation.reference_views import mean_psnr_on_device
-from recon_cli.train import async_trainer
 from recon_cli.train.importance import Importance
 from recon_cli.train.schedule import Schedule, next_iteration
 from recon_cli.train.state import TrainState
+from recon_cli.train.stepper import choose_stepper
 from recon_cli.train.task import Task
 
-_REPORT_EVERY = 100  # steps between looks at the validation views, at least
+_REPORT_EVERY = 100  # steps between reports on the validation views, at least
 _REPORTS = 40  # of a long run; each costs a picture of every validation view
 
 
@@ -31,34 +31,32 @@ def fit(
     """
     start, cpu_start = time.perf_counter(), time.process_time()
     every = report_every(task.schedule)
-    advance = async_trainer.choose_trainer(state, task, importance, lambda i: (
+    advance = choose_stepper(state, task, importance, lambda i: (
         i == until or i % every == 0 or any(callback.needs_step(i) for callback in callbacks)))
     while state.iteration < until:
         loss = advance()
         if state.iteration % every == 0 or state.iteration == until:
             psnr = validation_psnr(state, task)
             regular = state.iteration % every == 0
-            goes_on_at = _skip_to_iteration(state, task, psnr) if regular else None
+            skip_to = _choose_next_iteration(state, task, psnr) if regular else None
             report = TrainReport(
                 state.iteration, loss, psnr, len(state.splats), time.perf_counter() - start,
-                time.process_time() - cpu_start, goes_on_at)
+                time.process_time() - cpu_start, skip_to)
             for callback in callbacks:
                 callback.on_report(report)
-            if goes_on_at is not None:
-                state.jump = state.iteration, goes_on_at
-                state.iteration = goes_on_at
+            if skip_to is not None:
+                state.skipped_phase = state.iteration, skip_to
+                state.iteration = skip_to
         for callback in callbacks:
             callback.on_step(state.iteration, state.splats)
 
 
-def _skip_to_iteration(state: TrainState, task: Task, psnr: float | None) -> int | None:
-    """Returns the iteration to which the run jumps now, None where it just continues."""
-    if task.jump is not None:
-        return task.jump[1] if state.iteration == task.jump[0] else None
-    if psnr is None or not task.schedule.config.early_stop or state.jump:
+def _choose_next_iteration(state: TrainState, task: Task, psnr: float | None) -> int | None:
+    """Returns the iteration to which the run skips now, None where it just continues."""
+    if psnr is None or not task.schedule.config.early_stop or state.skipped_phase:
         return None
-    state.looks.append((state.iteration, psnr))
-    return next_iteration(task.schedule, state.iteration, state.looks)
+    state.validation_history.append((state.iteration, psnr))
+    return next_iteration(task.schedule, state.iteration, state.validation_history)
 
 
 def report_every(schedule: Schedule) -> int:

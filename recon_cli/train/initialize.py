@@ -10,18 +10,14 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from recon_cli.config.stages import RunConfig
-from recon_cli.deadline import Deadline
 from recon_cli.errors import TrainingError, format_count
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
-from recon_cli.train.background import FarContent, far_content, splats_of
-from recon_cli.train.exposure import Exposure, estimate_gains
-from recon_cli.train.photometry import Photometry, Vignettes
+from recon_cli.train.parts.part import Start
+from recon_cli.train.parts.photometry import Photometry
+from recon_cli.train.parts.table import PARTS
 from recon_cli.train.state import TrainState, load_state, new_state
-from recon_cli.train.stereo_points import SurfacePoints
 from recon_cli.train.task import Task
-from recon_cli.train.vignette_evidence import find_vignettes
 
 _OPACITY = 0.1  # initial opacity of the reference implementation
 _NEIGHBOURS = 3
@@ -71,49 +67,34 @@ def first_state(
     colors: NDArray[np.uint8],  # [P, 3]
     *,
     most: int,
-    far: FarContent | None = None,
 ) -> TrainState:
-    """Returns the first state of a run: Gaussians at `most` points, and the background `far`.
-
-    What lies far outside is told by the sparse points alone: walls have its colour behind them too.
-    Parts of the model may add points.
-    """
+    """Returns the first state of a run: Gaussians at `most` points, and what parts add to them."""
     config = task.schedule.config
-    if config.far != "on":
-        far = None
-    elif far is None:
-        far = far_content(task.train, points, task.extent)
-    photometry = new_photometry(task, points)
-    sparse = len(points)
-    surfaces = surfaces_of(task, sparse)
-    points = np.concatenate([points, surfaces.points])
-    colors = np.concatenate([colors, surfaces.colors])
-    if far is not None:
-        points = np.concatenate([points, far.gap_points])
-        colors = np.concatenate([colors, far.gap_colors])
+    start = Start(task, len(points), points, colors)
+    for part in PARTS:
+        if part.attach and part.is_on(config):
+            part.attach(start)
     # added Gaussians do not take the place of sparse points as long as there is room to grow
-    most = max(most, min(most + len(points) - sparse, config.max_gaussians // 2))
+    most = max(most, min(most + len(start.points) - start.sparse, config.max_gaussians // 2))
     grey = task.schedule.recipe.backdrop
     centers = np.stack([view.camera.center for view in task.train])
     splats = dataclasses.replace(
-        first_splats(config, points, colors, far, most=most),
+        _first_splats(start, most=most),
         backdrop=Backdrop.behind(grey, centers) if grey else None)
     return new_state(
         splats.map(lambda tensor: tensor.to(task.device)), config, task.means_unit,
-        backend=task.backend, photometry=photometry)
+        backend=task.backend, photometry=new_photometry(task, points))
 
 
-def surfaces_of(task: Task, sparse: int, deadline: Deadline | None = None) -> SurfacePoints:
-    """Returns the points by stereo that a run begins with, besides those of structure from motion.
-
-    They fill what `sparse` points leave of half of the cap: the rest goes where the error is.
-    OutOfTime where a search for them would not end by the deadline.
-    """
-    config = task.schedule.config
-    room = config.max_gaussians // 2 - sparse
-    if config.stereo != "on" or task.stereo is None or room <= 0:
-        return SurfacePoints.nothing()
-    return task.stereo.search(deadline).at_most(room, config.seed)
+def _first_splats(start: Start, *, most: int) -> Splats:
+    """Returns the Gaussians before the first step: at the points, and others that parts add."""
+    config = start.task.schedule.config
+    others = [splats for splats in start.splats if len(splats)]
+    at_points = splats_from_points(
+        start.points, start.colors,
+        most=max(most // 2, min(most, config.max_gaussians - sum(map(len, others)))),
+        seed=config.seed, sh_degree=config.sh_degree)
+    return joined([at_points, *others])[0] if others else at_points
 
 
 def restore_state(path: Path, task: Task) -> TrainState:
@@ -141,7 +122,7 @@ def make_finished_state(splats: Splats, task: Task) -> TrainState:
         splats.map(lambda tensor: tensor.to(task.device)), task.schedule.config, task.means_unit,
         backend=task.backend)
     state.iteration = task.schedule.config.iterations
-    state.jump = 0, state.iteration
+    state.skipped_phase = 0, state.iteration
     return state
 
 
@@ -152,27 +133,6 @@ def new_photometry(
 
     It starts with what `points` [P, 3] show; without them with no gain or vignette.
     """
-    config, views = task.schedule.config, task.train
-    gains = exponents = None
-    if points is not None and config.exposure == "on":
-        gains = estimate_gains(views, points).log_gains
-    if points is not None and config.vignette == "on":
-        exponents = find_vignettes(views, points).exponents
-    return Photometry.from_parts(
-        Exposure(len(views), start=gains) if config.exposure == "on" else None,
-        Vignettes([view.camera for view in views], start=exponents)
-        if config.vignette == "on" else None)
-
-
-def first_splats(
-    config: RunConfig, points: NDArray[np.float64], colors: NDArray[np.uint8],
-    far: FarContent | None, *, most: int,
-) -> Splats:
-    """Returns the Gaussians before the first step: of the points, and of places far outside."""
-    outside = 0 if far is None else len(far.positions)
-    near = splats_from_points(
-        points, colors, most=max(most // 2, min(most, config.max_gaussians - outside)),
-        seed=config.seed, sh_degree=config.sh_degree)
-    if far is None or len(far.positions) == 0:
-        return near
-    return joined([near, splats_of(far, near.sh_rest.shape[1])])[0]
+    fitted = [part.fit(task, points) for part in PARTS
+              if part.fit and part.is_on(task.schedule.config)]
+    return Photometry(fitted) if fitted else None

@@ -29,9 +29,9 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats, joined
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.train.blocks import MERGE_SHARE, BlockJob, record
-from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.initialize import begin_state, restore_state
-from recon_cli.train.photometry import write_photometry
+from recon_cli.train.parts.photometry import write_photometry
+from recon_cli.train.parts.table import PARTS, model_parts
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.schedule import make_schedule
 from recon_cli.train.state import TrainState
@@ -146,15 +146,11 @@ def _run_config(
 ) -> RunConfig:
     """Returns the options of the fine-tuning: those of the blocks."""
     configs = [block.config for block in blocks]
-    denoised = all(each.images == "denoised" for each in configs)
-    fitted: dict[str, Any] = {
-        part: "on" if steps > 0 and any(getattr(each, part) == "on" for each in configs)
-              else "off" for part in ("exposure", "vignette")}
+    parts: dict[str, Any] = {part.name: part.merge(configs, fits=steps > 0) for part in PARTS}
+    parts["sh_degree"] = degree
     return dataclasses.replace(
         configs[0], iterations=max(1, steps), max_size=max(each.max_size for each in configs),
-        sh_degree=degree, max_gaussians=max(MIN_GAUSSIANS, count), far="off", stereo="off",
-        images="denoised" if denoised else "original",
-        early_stop=False, **fitted)
+        max_gaussians=max(MIN_GAUSSIANS, count), early_stop=False, **parts)
 
 
 def _finetune(

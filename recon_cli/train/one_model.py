@@ -11,10 +11,10 @@ from recon_cli.context import StageContext
 from recon_cli.io.views import size_summary
 from recon_cli.scene.scene import Scene
 from recon_cli.splats.ply import write_ply
-from recon_cli.train.feature_trials import model_parts
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.moving_masks import EditedMasks, read_summary
-from recon_cli.train.photometry import write_photometry
+from recon_cli.train.masks import EditedMasks, read_summary
+from recon_cli.train.parts.photometry import write_photometry
+from recon_cli.train.parts.table import model_parts
 from recon_cli.train.plan import first_or_saved, plan_task
 from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
 from recon_cli.train.state import TrainState, save_state
@@ -57,7 +57,7 @@ def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> T
         iterations=state.steps, gaussians=len(state.splats),
         initial_gaussians=state.first_count, max_gaussians=config.max_gaussians,
         max_size=config.max_size, planned_iterations=config.iterations,
-        stopped_early_at=state.jump[0] if state.jump else None,
+        stopped_early_at=state.skipped_phase[0] if state.skipped_phase else None,
         training_views=len(task.train), validation_views=len(task.validation),
         **size_summary([view.camera for view in task.train]),
         validation_psnr_db=last.validation_psnr_db, train_seconds=last.seconds,

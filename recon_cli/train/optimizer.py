@@ -103,14 +103,6 @@ class SplatOptimizer:
         return gradient
 
     @torch.no_grad()
-    def take_gradients(self) -> None:
-        """Takes the gradients that autograd left in `splats` for those of the next step."""
-        for name, value in self.splats.parameters().items() if self.fused else ():
-            if value.grad is not None:
-                self._view(name, "gradient").copy_(value.grad)
-            value.grad = None
-
-    @torch.no_grad()
     def accumulate(self, share: float, *, sh_rest: bool) -> None:
         """Adds a share of the gradients, those of one view of several, and uses them up."""
         for name in self._names(sh_rest=sh_rest):

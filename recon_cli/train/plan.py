@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,10 +25,12 @@ from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate
-from recon_cli.train.feature_trials import Needs, TrialScene, examine, model_parts
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.initialize import first_state, restore_state, surfaces_of
-from recon_cli.train.moving_masks import EditedMasks, copy_masks, with_masks, write_masks
+from recon_cli.train.initialize import first_state, restore_state
+from recon_cli.train.masks import EditedMasks, copy_masks, with_masks, write_masks
+from recon_cli.train.parts.part import TrialScene
+from recon_cli.train.parts.table import PARTS, model_parts
+from recon_cli.train.parts.trials import Needs, examine
 from recon_cli.train.schedule import RECIPES, Schedule, make_schedule
 from recon_cli.train.state import TrainState
 from recon_cli.train.task import Task
@@ -261,17 +264,18 @@ def plan_task(
     if needs.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)
     detail = count_detail(task.train)  # behind what moves there is as much as beside it
-    if needs.moving is not None:
-        write_masks(out, given, needs.moving, edited)
+    if needs.masks is not None:
+        write_masks(out, given, needs.masks, edited)
         scene = with_masks(given, out)
         task = load_task(scene, dataclasses.replace(first, images=needs.config.images), ctx)
     asked = dataclasses.replace(config, **model_parts(needs.config))
     facts = gather_facts(task, scene, fit_memory, detail)
-    if config.stereo == "on":  # asked for, whatever it takes
+    if any(part.prepare and part.is_on(config) for part in PARTS):  # asked for, whatever it takes
         extras = Deadline()
     timed = _plan_in_time(asked, facts, task, scene, out, deadline, extras, model)
     given_up = [f"{one.name} is {'on' if one.on else 'off'}" for one in needs.untried]
-    given_up += ["stereo is off"] if timed[0].stereo != asked.stereo else []
+    given_up += [f"{part.name} is off" for part in PARTS
+                 if part.is_on(asked) and not part.is_on(timed[0])]
     asked, plan = timed
     if given_up:
         ctx.notice(f"{seconds:.0f} s of training leave no time to try all parts of the model: "
@@ -289,11 +293,12 @@ def _plan_in_time(
 ) -> tuple[TrainConfig, TrainPlan]:
     """Returns the options, and the plan by timed steps that ends by the deadline.
 
-    Surfaces are left out whose search would not end by that of the `extras`.
+    Parts are left out whose search would not end by that of the `extras`.
     """
     def search(asked: TrainConfig, likely: RunConfig) -> TrainConfig:
-        found = model is not None or _search_surfaces(likely, facts, task, extras)
-        return asked if found else dataclasses.replace(asked, stereo="off")
+        late = [] if model is not None else _find_late_parts(likely, task, scene, extras)
+        off: dict[str, Any] = dict.fromkeys(late, "off")
+        return dataclasses.replace(asked, **off)
 
     def plan() -> TrainPlan:
         left = max(deadline.left, STEPS_SHARE * deadline.seconds)
@@ -332,17 +337,19 @@ def choose_parts(
     return needs
 
 
-def _search_surfaces(config: RunConfig, facts: Facts, task: Task, deadline: Deadline) -> bool:
-    """Searches the surfaces that a run begins with, once at most; returns whether there was time.
-    """
-    try:
-        found = surfaces_of(
-            dataclasses.replace(task, schedule=Schedule(config)), facts.points, deadline)
-    except OutOfTime:
-        return False
-    logger.info("%s points on surfaces besides %s of sfm", f"{len(found.points):,}",
-                f"{facts.points:,}")
-    return True
+def _find_late_parts(
+    config: RunConfig, task: Task, scene: Scene, deadline: Deadline
+) -> list[str]:
+    """Searches what parts add to the start, once at most; returns those without time for it."""
+    task = dataclasses.replace(task, schedule=Schedule(config))
+    late = []
+    for part in PARTS:
+        if part.prepare and part.is_on(config):
+            try:
+                part.prepare(task, task.evidence_of(scene.points), deadline)
+            except OutOfTime:
+                late.append(part.name)
+    return late
 
 
 def _measure_cost(

@@ -25,7 +25,7 @@ from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit import validation_psnr
 from recon_cli.train.importance import Importance
 from recon_cli.train.initialize import make_finished_state, restore_state
-from recon_cli.train.moving_masks import with_masks
+from recon_cli.train.masks import with_masks
 from recon_cli.train.prune_loop import PruneRun, remaining, rounds_within
 from recon_cli.train.runner import LOG, Segment, TrainLog, run_fit, seconds_at
 from recon_cli.train.schedule import RecoverySchedule

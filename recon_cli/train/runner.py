@@ -104,22 +104,23 @@ class TrainLog(TrainCallback):
 
     def on_report(self, report: TrainReport) -> None:
         """Appends a report; its seconds count from the very start of training."""
-        self._write(dataclasses.asdict(report), report.seconds, report.cpu_seconds)
+        self._write(LogRow(**dataclasses.asdict(report)))
 
     def add_idle(self, iteration: int, seconds: float, cpu_seconds: float) -> None:
         """Counts time in which no step was taken, and keeps the log for a later run."""
-        self._write({"iteration": iteration}, seconds, cpu_seconds)
+        self._write(LogRow(iteration=iteration, seconds=seconds, cpu_seconds=cpu_seconds))
         self.keep()
 
     def keep(self) -> None:
         """Records the log up to here, for a later run that continues from here."""
         journal.expect_growth(self._path)
 
-    def _write(self, row: dict[str, object], seconds: float, cpu_seconds: float) -> None:
-        row["seconds"] = round(self._earlier + seconds, 3)
-        row["cpu_seconds"] = round(self._earlier_cpu + cpu_seconds, 3)
+    def _write(self, row: LogRow) -> None:
+        row = dataclasses.replace(
+            row, seconds=round(self._earlier + row.seconds, 3),
+            cpu_seconds=round(self._earlier_cpu + row.cpu_seconds, 3))
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+            file.write(json.dumps(row.to_json()) + "\n")
 
 
 class ProgressCallback(TrainCallback):
@@ -138,9 +139,9 @@ class ProgressCallback(TrainCallback):
         psnr = report.validation_psnr_db
         validation = "" if psnr is None else f", validation {psnr:.2f} dB"
         self._bar.note(f"loss {report.loss:.4f}{validation}, {report.gaussians:,} Gaussians")
-        if report.goes_on_at is not None:
+        if report.skip_to_iteration is not None:
             logger.info("the validation score is flat after step %d: the run continues at "
-                        "step %d, with falling rates", report.iteration, report.goes_on_at)
+                        "step %d, with falling rates", report.iteration, report.skip_to_iteration)
 
 
 class CheckpointThrottle:

@@ -18,13 +18,13 @@ _WINDOW = 0.1  # of the run's steps, in which so much must be gained
 
 
 def next_iteration(
-    schedule: Schedule, iteration: int, looks: list[tuple[int, float]]
+    schedule: Schedule, iteration: int, history: list[tuple[int, float]]
 ) -> int | None:
     """Returns the step at which the final phase begins if the run goes there now, else None.
 
     It does where the best validation PSNR of the last tenth of the run is less than .02 dB above
-    the best one before, once densification has ended and the state for pruning is kept. `looks` are
-    (iteration, validation PSNR in dB) so far, ascending.
+    the best one before, once densification has ended and the state for pruning is kept. `history`
+    holds (iteration, validation PSNR in dB) so far, ascending.
     """
     first, steps, recipe = schedule.first, schedule.steps, schedule.recipe
     final = first + round(min(recipe.final_from, _LAST_FIFTH) * steps)
@@ -32,16 +32,11 @@ def next_iteration(
     if not settled < iteration < final:
         return None
     since = iteration - _WINDOW * steps
-    before = [psnr for at, psnr in looks if at <= since]
-    lately = [psnr for at, psnr in looks if at > since]
+    before = [psnr for at, psnr in history if at <= since]
+    lately = [psnr for at, psnr in history if at > since]
     if not before or not lately or max(lately) - max(before) >= _GAIN:
         return None
     return final
-# Of sensor depth in the loss: at the start, where it places the surfaces, and the share that is
-# left at the end, where the images place what is finer than noise. Twice as much gave no better
-# surfaces in three rooms, and cost .2 dB in one.
-_DEPTH_WEIGHT, _DEPTH_END = 0.005, 0.03
-_DEPTH_EVERY = 2  # steps; densification looks at the others, which colours alone decide
 
 
 @dataclass(frozen=True)
@@ -103,12 +98,13 @@ class Schedule:
     """The plan of one run; iterations count from 1."""
 
     config: RunConfig  # the run's options
-    recipe: Recipe = None  # type: ignore[assignment]  # that of the strategy, filled in below
+    own_recipe: Recipe | None = None  # in place of that of the strategy
     first: int = 0  # step after which it begins; shares are of the steps from there
 
-    def __post_init__(self) -> None:
-        if self.recipe is None:
-            object.__setattr__(self, "recipe", RECIPES[self.config.densify])
+    @property
+    def recipe(self) -> Recipe:
+        """The plan that shares are taken from."""
+        return self.own_recipe or RECIPES[self.config.densify]
 
     @property
     def length(self) -> int:
@@ -166,15 +162,6 @@ class Schedule:
             return 1.0
         done = max(0.0, (self.share(iteration) - start) / (1 - start))
         return float(self.recipe.final_rate**done)
-
-    def depth_weight(self, iteration: int) -> float:
-        """Returns the weight of sensor depth in the loss of a step, 0 where it has no part.
-
-        It is least from the start where another run has placed the surfaces.
-        """
-        if self.config.depth != "on" or iteration % _DEPTH_EVERY:
-            return 0.0
-        return float(_DEPTH_WEIGHT * _DEPTH_END ** (1.0 if self.first else self.share(iteration)))
 
     def moves_sh(self, iteration: int) -> bool:
         """Tells whether the higher degrees are moved in this step."""

@@ -17,7 +17,7 @@ from recon_cli.render import Statistics
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import Splats
 from recon_cli.train.optimizer import SplatOptimizer
-from recon_cli.train.photometry import Photometry
+from recon_cli.train.parts.photometry import Photometry
 from recon_cli.workspace.atomic import parse_json, replacing
 
 LONG_SAVE = 0.25  # seconds; a checkpoint that takes longer is written less often
@@ -87,14 +87,16 @@ class TrainState:
     first_count: int = 0  # Gaussians before the first step; budgets grow from there
     skipped: int = 0  # steps whose loss was not finite, and that changed nothing
     # (iteration, validation PSNR in dB) at each regular report so far
-    looks: list[tuple[int, float]] = field(default_factory=list)
-    jump: tuple[int, int] | None = None  # iterations of an early stop, and at which it continued
+    validation_history: list[tuple[int, float]] = field(default_factory=list)
+    # iterations of an early stop, and at which it continued
+    skipped_phase: tuple[int, int] | None = None
     photometry: Photometry | None = None  # of the training images; None where no part is fitted
 
     @property
     def steps(self) -> int:
         """Steps really taken."""
-        return self.iteration - (self.jump[1] - self.jump[0] if self.jump else 0)
+        begin, end = self.skipped_phase or (0, 0)
+        return self.iteration - (end - begin)
 
     @property
     def splats(self) -> Splats:
@@ -124,7 +126,7 @@ def save_state(path: Path, state: TrainState) -> None:
     check_finite(tensors, "Training diverged")
     scalars = {"version": _VERSION, "iteration": state.iteration, "queue": state.queue,
                "first_count": state.first_count, "skipped": state.skipped,
-               "looks": state.looks, "jump": state.jump,
+               "looks": state.validation_history, "jump": state.skipped_phase,
                "backdrop": state.splats.backdrop and state.splats.backdrop.numbers}
     with replacing(path) as temporary:
         save_file({name: value.contiguous().cpu() for name, value in tensors.items()},

@@ -1,20 +1,46 @@
-"""The task of a fit: the views, at every size that a run asks for, and the plan."""
+"""The task of a fit: the views, at every size that a run asks for, the plan, and the evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.io.images import reduce_view
+from recon_cli.progress import NullProgress, Progress
 from recon_cli.scene.cells import Cell
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.stereo_points import StereoPoints
+
+Found = TypeVar("Found")
+Tracks = Sequence[NDArray[np.int64]]  # rows of the points that each view sees; empty: not known
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is known of a scene before any training; tasks of reduced views share it."""
+
+    views: Sequence[TrainView]  # to train on, in full size
+    points: NDArray[np.float64]  # [P, 3] sparse points, world units
+    extent: float  # of the cameras, world units
+    # reads which points each view sees; None where nothing is known of how they were found
+    tracks: Callable[[], Tracks] | None = None
+    progress: Progress = field(default_factory=NullProgress)
+    _found: dict[object, Any] = field(default_factory=dict)
+
+    def once(self, search: Callable[..., Found], *options: object) -> Found:
+        """Returns what a search finds here; it runs once, and again only where it had no time."""
+        if search not in self._found:
+            self._found[search] = search(self, *options)
+        found: Found = self._found[search]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +54,8 @@ class Task:
     backend: str  # name of the rasterizer
     device: torch.device  # where the tensors live
     nearness: float | None = None  # `Scene.nearness`; None where there are no points
-    jump: tuple[int, int] | None = None  # `TrainState.jump` of the run that this one branches off
     cell: Cell | None = None  # where Gaussians may be added; None: everywhere
-    stereo: StereoPoints | None = None  # of the training views; None where they are not known
+    evidence: Evidence | None = None  # None where no more is known than these views
     depth_refused: str = ""  # why no view has sensor depth although the capture has some
 
     def inside(self, means: Tensor) -> Tensor | float:  # [N, 3] -> [N]
@@ -49,6 +74,10 @@ class Task:
         if self.schedule.recipe.means_unit == "extent" or self.nearness is None:
             return self.extent
         return self.nearness
+
+    def evidence_of(self, points: NDArray[np.float64]) -> Evidence:
+        """Returns what is known of the scene, of which these are the sparse points [P, 3]."""
+        return self.evidence or Evidence(self.train, points, self.extent)
 
     @property
     def has_depth(self) -> bool:

@@ -18,21 +18,15 @@ from recon_cli.errors import ConfigError, FormatError, TrainingError, format_cou
 from recon_cli.io import views as view_files
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
-from recon_cli.io.sensor_depth import (
-    MOST_SAMPLES,
-    SAMPLE_BYTES,
-    SensorViews,
-    read_sensor_depth,
-)
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.parts.depth import depth_bytes, load_sensor_depth
 from recon_cli.train.schedule import Schedule
-from recon_cli.train.stereo_points import SparseModel, StereoPoints
-from recon_cli.train.task import Task
+from recon_cli.train.task import Evidence, Task, Tracks
 from recon_cli.workspace.atomic import read_json, write_bytes
 
 logger = logging.getLogger("recon")
@@ -76,36 +70,17 @@ def load_task(scene: Scene, config: RunConfig, ctx: StageContext) -> Task:
     return Task(
         train, [*validation], Schedule(config), scene.extent,
         ctx.backend, torch.device(ctx.device), nearness=nearness, cell=scene.cell,
-        stereo=StereoPoints(
-            train, lambda: _sparse_model(scene, [view.name for view in views]), ctx.progress),
+        evidence=Evidence(
+            train, scene.points, scene.extent,
+            lambda: _read_tracks(scene, [view.name for view in views]), ctx.progress),
         depth_refused=sensor.refused)
 
 
-def load_sensor_depth(scene: Scene, config: RunConfig) -> SensorViews:
-    """Returns the sensor depth of the training views, none if the options do without.
-
-    Raises:
-        ConfigError: the options ask for it, but there is none that fits.
-    """
-    if config.depth == "off" or (config.depth == "auto" and config.densify == "reference"):
-        return SensorViews()  # 3DGS knows of no depth
-    sensor = read_sensor_depth(scene)
-    if sensor.left_out:
-        logger.info("sensor depth contradicts the model in %d views, and is not used there: %s",
-                    len(sensor.left_out), ", ".join(sensor.left_out))
-    if config.depth == "on" and not sensor.depths and scene.cell is None:
-        raise ConfigError(
-            "depth is on, but " + (f"the sensor depth does not fit: {sensor.refused}."
-                                   if sensor.refused else "no training view has sensor depth."),
-            hint="Leave out --depth on.")
-    return sensor
-
-
-def _sparse_model(scene: Scene, names: Sequence[str]) -> SparseModel:
-    """Returns the records of the views of these names."""
+def _read_tracks(scene: Scene, names: Sequence[str]) -> Tracks:
+    """Returns the rows of the points that the views of these names see."""
     seen = {} if scene.sparse is None else read_visibility(scene.sparse)
     nothing = np.empty(0, np.int64)
-    return SparseModel(scene.points, [seen.get(name, nothing) for name in names])
+    return [seen.get(name, nothing) for name in names]
 
 
 def _refuse_tiny_units(scene: Scene) -> None:
@@ -146,7 +121,7 @@ def read_config(folder: Path) -> RunConfig:
         FormatError: a version before this one wrote a value that this one does not know.
     """
     path = folder / "config.json"
-    values = read_json(path, dict, hint="Run `recon train --again`.")
+    values = RunConfig.rename(read_json(path, dict, hint="Run `recon train --again`."))
     names = {item.name for item in dataclasses.fields(RunConfig)}
     try:
         return RunConfig(**{name: value for name, value in values.items() if name in names})
@@ -262,10 +237,7 @@ def _memory(
         views=len(views), width=width, height=height, gaussians=gaussians,
         fused=ctx.backend == "numba", sh_degree=config.sh_degree,
         masks=sum(view.mask is not None for view in views), free=_host_bytes(ctx))
-    if scene.depth is None or config.depth == "off":
-        return needed
-    return dataclasses.replace(
-        needed, images=needed.images + len(scene.train) * MOST_SAMPLES * SAMPLE_BYTES)
+    return dataclasses.replace(needed, images=needed.images + depth_bytes(scene, config))
 
 
 def _free_bytes(ctx: StageContext) -> int:

@@ -62,7 +62,7 @@ def assess(task: TrustTask, out: Path, ctx: StageContext) -> TrustRecord:
         cells = find_cells(task.rendered.splats, trust.support)
         assessed = model_trust(
             trust, task.rendered, surface_shares(cells), task.held_out,
-            gains=task.config.exposure == "on",
+            gains=task.config.has_gains,
             on_view=_saver(out / FOLDER / task.model, bar.advance))
     frames = [view.name for view in evenly_spread(task.scene.train, MAX_VIEWS)]
     record = TrustRecord(

@@ -191,7 +191,7 @@ def measure_trust(
 
     `max_size` is the longest side in pixels at which errors are compared.
     """
-    gains = config.exposure == "on"
+    gains = config.has_gains
     every = evenly_spread(scene.train, MAX_VIEWS)
     cameras = [view.camera for view in every]
     apart = pose_distances(cameras, model.splats)

@@ -29,7 +29,7 @@ from recon_cli.scene.train_view import leaves_enough
 from recon_cli.splats.html import find_title
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.registry import read_splats
-from recon_cli.train.moving_masks import read_summary
+from recon_cli.train.masks import read_summary
 from recon_cli.viewer.gaussians import PackedSplats, pack_splats
 from recon_cli.viewer.keyframes import PathFolder
 

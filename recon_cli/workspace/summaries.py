@@ -239,7 +239,8 @@ class LogRow(JsonRecord):
     loss: float | None = None
     validation_psnr_db: float | None = None
     gaussians: int | None = None
-    goes_on_at: int | None = None  # iteration to which the run jumped
+    # to which the run skipped
+    skip_to_iteration: int | None = field(default=None, metadata={KEY: "goes_on_at"})
 
     @classmethod
     def read_all(cls, log: Path) -> tuple[LogRow, ...]:

@@ -9,7 +9,7 @@ from recon_cli.api import Workspace
 TINY = {
     "ingest": {"frames": 16, "max_size": 320},
     "sfm": {"max_features": 1500, "accept_weak": True, "min_registered": 0.3},
-    "train": {"iterations": 60, "max_size": 160, "max_gaussians": 3000, "far": "off",
+    "train": {"iterations": 60, "max_size": 160, "max_gaussians": 3000, "background": "off",
               "exposure": "off", "images": "original", "sh_degree": 1},
     "prune": {"rounds": 1, "recovery": 10},
 }

@@ -108,7 +108,7 @@ def print_bounds(workspaces: tuple[Path, ...], ctx: StageContext) -> None:
             after = mean_psnr(bounded, views, bounded.sh_degree, ctx.backend)
             ratio = (bounds.bounding_sphere(bounded.means.double())
                      / bounds.bounding_sphere(inside))
-            print_row(root.name, config.far, name, f"{len(bounded):,}", f"{ratio:.1f}",
+            print_row(root.name, config.background, name, f"{len(bounded):,}", f"{ratio:.1f}",
                       f"{after:.2f}", f"{after - before:+.2f}", f"{seconds:.1f}")
 
 

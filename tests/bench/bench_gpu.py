@@ -43,7 +43,7 @@ from recon_cli.render.contract import NEAR
 from recon_cli.render.triton import step as triton_step
 from recon_cli.render.triton.step_status import StepReport
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train import async_trainer
+from recon_cli.train import stepper
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import TrainState, new_state
 from recon_cli.train.task import Task
@@ -169,7 +169,7 @@ def training(
 
 def stretch(state: TrainState, task: Task, start: int, steps: int) -> Callable[[], None]:
     """Returns a function that takes the steps after `start`, as `recon train` does, and waits."""
-    advance = async_trainer.choose_trainer(state, task, None, lambda now: now == start + steps)
+    advance = stepper.choose_stepper(state, task, None, lambda now: now == start + steps)
 
     def take() -> None:
         state.iteration = start
@@ -290,7 +290,7 @@ def check_waiting(figures: Figures, size: SceneSize) -> None:
     state, task = training(size, figures.device, still=True)
     for start in (_GATHERING, _AFTER):
         state.iteration = start
-        steps = async_trainer.AsyncTrainer(state, task, lambda _: False)
+        steps = stepper.AsyncStepper(state, task, lambda _: False)
         steps._start()  # compiles
         torch.cuda.synchronize()
         found = f"{_FREE} steps from {start:,} on, recordings among them"
@@ -431,7 +431,7 @@ def steps(figures: Figures, size: SceneSize, rounds: int, count: int) -> None:
 def _started(state: TrainState, task: Task) -> float:
     """Returns the milliseconds in which the host starts a step that was recorded before."""
     state.iteration = _GATHERING
-    trainer = async_trainer.AsyncTrainer(state, task, lambda _: False)
+    trainer = stepper.AsyncStepper(state, task, lambda _: False)
     for _ in range(_RECORDED):
         trainer._start()
     torch.cuda.synchronize()

@@ -35,8 +35,8 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
-from recon_cli.stereo.depths import places
-from recon_cli.train.moving_masks import FOLDER, file_name
+from recon_cli.stereo.depths import unproject
+from recon_cli.train.masks import FOLDER, file_name
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace.summaries import TrainPlan
 
@@ -71,7 +71,7 @@ def room_scene(folder: Path) -> Scene:
         if depth is None or row % 8 == 0:
             continue
         pixels = draw.permutation(np.flatnonzero(depth > 0))[:_POINTS]
-        points.append(places(view.camera, depth, pixels))
+        points.append(unproject(view.camera, depth, pixels))
         image = read_image(view.original, view.camera.width, view.camera.height)
         colors.append(image.reshape(-1, 3)[pixels])
     train = [view for row, view in enumerate(path) if row % 8]
@@ -272,7 +272,7 @@ def main(
     workbench.numba_context()
     scene, splats = open_scene(folder)
     config = TrainConfig(
-        iterations=iterations, max_size=max_size, sh_degree=1, far="off", exposure="off",
+        iterations=iterations, max_size=max_size, sh_degree=1, background="off", exposure="off",
         stereo="off", validation=0.0, moving="off")
     if (out / "clean/splats.ply").exists():
         clean, seconds = read_ply(out / "clean/splats.ply"), 0.0

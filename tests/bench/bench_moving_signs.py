@@ -19,8 +19,9 @@ import workbench
 from recon_cli.config.stages import TrainConfig
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
-from recon_cli.train.feature_trials import TrialScene, short_model
-from recon_cli.train.moving_search import Judge, are_enough, find_signs, first_look
+from recon_cli.train.parts.moving import ViewComparer, find_detections, have_evidence, preview_rows
+from recon_cli.train.parts.part import TrialScene
+from recon_cli.train.parts.trials import Trials
 from recon_cli.train.plan import first_config
 from recon_cli.train.train_data import load_task
 
@@ -30,15 +31,16 @@ _SIZE, _LEVEL = 300, 2  # pixels of the views, and what the trial reduces them b
 def look_at(scene: Scene, name: str) -> Splats:
     """Prints what the first look finds in a scene, and returns the short model."""
     config = dataclasses.replace(first_config(TrainConfig(
-        sh_degree=1, far="off", exposure="off", max_size=_SIZE)), stereo="off")
+        sh_degree=1, background="off", exposure="off", max_size=_SIZE)), stereo="off")
     task = load_task(scene, config, workbench.numba_context())
-    model = short_model(TrialScene(task, scene.points, scene.colors, None), _LEVEL)
+    trials = Trials(TrialScene(task, scene.points, scene.colors, None))
+    model = trials.model(config, _LEVEL)
     start = time.process_time()
-    looked = Judge(config.sh_degree, "numba").compare(
-        model, [task.train[row] for row in first_look(len(task.train))])
-    signs = find_signs(looked)
+    compared = ViewComparer(config.sh_degree, "numba").compare(
+        model, [task.train[row] for row in preview_rows(len(task.train))])
+    signs = find_detections(compared)
     workbench.print_row(name, str(len(signs)), str(signs.sum()), f"{signs.mean():.0%}",
-                        "yes" if are_enough(signs) else "no",
+                        "yes" if have_evidence(signs) else "no",
                         f"{time.process_time() - start:.1f}")
     return model
 

@@ -16,7 +16,6 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,6 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.plan import Facts, count_detail, useful_cap
-from recon_cli.train.stereo_points import StereoPoints
 from recon_cli.train.task import Task
 from recon_cli.train.train_data import load_task
 
@@ -96,8 +94,8 @@ def open_capture(workspace: Path, rooms: Path, config: RunConfig, ctx: StageCont
     away = choose_stretches(len(whole.train))
     scene, sparse = take_away(whole, away, away)
     task = load_task(scene, config, ctx)
-    stereo = StereoPoints(task.train, partial(lambda model: model, sparse), ctx.progress)
-    task = dataclasses.replace(task, stereo=stereo, validation=[])
+    evidence = dataclasses.replace(sparse, views=task.train)
+    task = dataclasses.replace(task, evidence=evidence, validation=[])
     facts = Facts(count_detail(task.train), len(task.train), len(scene.points), 0)
     task = planned(task, {"max_gaussians": useful_cap(facts, config.iterations)}, 0)
     names = sorted(view.name for view in whole.train)
@@ -159,7 +157,7 @@ def main(workspaces: tuple[Path, ...], rooms: Path, common: tuple[str, ...],
     ctx = numba_context(threads)
     config = RunConfig(
         iterations=iterations, max_size=max_size, validation=0.0, max_gaussians=1000, sh_degree=2,
-        images="original", far="on", stereo="on", exposure="off", early_stop=False)
+        images="original", background="on", stereo="on", exposure="off", early_stop=False)
     shared = {name: value for text in common for name, value in parsed(text).items()}
     print_head("scene", "change", "seed", *KINDS, "Gaussians", "CPU s")
     gains: dict[tuple[str, str], list[float]] = {}

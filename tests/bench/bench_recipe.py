@@ -16,7 +16,6 @@ from __future__ import annotations
 import dataclasses
 import statistics
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -43,8 +42,7 @@ from recon_cli.scene.scene import Scene
 from recon_cli.train.plan import Facts, count_detail, useful_cap
 from recon_cli.train.schedule import RECIPES, Recipe, Schedule
 from recon_cli.train.state import TrainState
-from recon_cli.train.stereo_points import SparseModel, StereoPoints
-from recon_cli.train.task import Task
+from recon_cli.train.task import Evidence, Task
 from recon_cli.train.train_data import load_task
 
 WARM = 20  # steps that load what is compiled
@@ -113,7 +111,7 @@ def row(name: str, task: Task, scene: Scene, changes: dict[str, Any], seeds: ran
             f"{middle[4]:,.0f}", f"{middle[3]:.0f}")
 
 
-def without_stretches(scene: Scene) -> tuple[Scene, SparseModel]:
+def without_stretches(scene: Scene) -> tuple[Scene, Evidence]:
     """Returns the scene without stretches of its training views, whose middle is validated."""
     place = np.arange(len(scene.train)) % EVERY - (EVERY // 2 - 1)
     return take_away(scene, np.abs(place) <= GAP // 2, np.abs(place) <= MIDDLE // 2)
@@ -121,7 +119,7 @@ def without_stretches(scene: Scene) -> tuple[Scene, SparseModel]:
 
 def take_away(
     scene: Scene, away: NDArray[np.bool_], scored: NDArray[np.bool_]
-) -> tuple[Scene, SparseModel]:
+) -> tuple[Scene, Evidence]:
     """Returns the scene without some of its training views by name, some of which are validated.
 
     The rows of a sparse model change with the points that go.
@@ -136,7 +134,7 @@ def take_away(
     rest = dataclasses.replace(
         scene, train=train, points=scene.points[kept], colors=scene.colors[kept],
         validation=tuple(view for view, own in zip(views, scored, strict=True) if own))
-    return rest, SparseModel(rest.points, seen)
+    return rest, Evidence([], rest.points, rest.extent, lambda: seen)
 
 
 @click.command()
@@ -160,7 +158,7 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
     base = RunConfig(
         iterations=iterations, max_size=max_size, validation=validation,
         max_gaussians=max_gaussians or 1000,  # until the plan's is known
-        images="original", far="on", exposure="off",
+        images="original", background="on", exposure="off",
         early_stop=False)
     shared = {name: value for text in common for name, value in parsed(text).items()}
     print_head(
@@ -171,8 +169,8 @@ def main(workspaces: tuple[Path, ...], common: tuple[str, ...], changed: tuple[s
             scene, sparse = without_stretches(scene)
         task = load_task(scene, base, ctx)
         if stretches:
-            stereo = StereoPoints(task.train, partial(lambda model: model, sparse), ctx.progress)
-            task = dataclasses.replace(task, stereo=stereo)
+            task = dataclasses.replace(
+                task, evidence=dataclasses.replace(sparse, views=task.train))
         if max_gaussians == 0:
             facts = Facts(count_detail(task.train), len(task.train), len(scene.points), 0)
             task = planned(task, {"max_gaussians": useful_cap(facts, iterations)}, 0)

@@ -35,8 +35,8 @@ from recon_cli.context import StageContext
 from recon_cli.evaluation.metrics import corrected_psnr, psnr
 from recon_cli.evaluation.reference_views import render_view
 from recon_cli.scene.scene import Scene
-from recon_cli.train.exposure import estimate_gains
-from recon_cli.train.feature_trials import PARTS
+from recon_cli.train.parts.sparse_points import estimate_gains
+from recon_cli.train.parts.table import PARTS
 from recon_cli.train.plan import Facts, cap, choose_parts, count_detail, first_config
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task

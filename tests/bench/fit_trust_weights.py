@@ -75,7 +75,7 @@ def open_capture(workspace: Path, max_size: int, iterations: int) -> Capture:
     names = {view.name for view in stretch}
     low, high = min(names), max(names)
     config = RunConfig(iterations=iterations, max_size=max_size, max_gaussians=30_000, sh_degree=1,
-                       images="original", far="off", exposure="off")
+                       images="original", background="off", exposure="off")
     return Capture(
         replace(scene, train=tuple(view for view in every if view.name not in names),
                 # a validation view in the stretch would show what is missing

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
-from recon_cli.stereo.depths import places
+from recon_cli.stereo.depths import unproject
 
 Array = NDArray[np.float64]
 _LIGHT = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
@@ -99,7 +99,7 @@ def _shadow(
 ) -> NDArray[np.bool_]:
     """Darkens the floor about the feet and returns where that shows."""
     pixels = np.arange(depth.size)
-    where = places(camera, depth, pixels)
+    where = unproject(camera, depth, pixels)
     shaded = np.zeros(depth.size, np.bool_)
     for thing in things:
         low = (np.abs(where[:, 2]) < 0.4 * thing.reach) & (depth.reshape(-1) > 0)

@@ -86,7 +86,7 @@ def test_the_options_of_a_protocol_can_be_given_again() -> None:
 
 def test_trials_may_fill_in_what_a_followed_protocol_leaves_automatic() -> None:
     settled = SettledConfig(**dataclasses.asdict(TrainConfig(protocol="recon")))
-    assert dataclasses.replace(settled, sh_degree=1, far="on").validation == 0.0
+    assert dataclasses.replace(settled, sh_degree=1, background="on").validation == 0.0
 
 
 def test_without_a_protocol_the_fingerprint_is_the_one_of_before() -> None:

@@ -161,6 +161,17 @@ def test_options_that_are_gone_are_refused_where_they_ask_for_more(text, tmp_pat
     assert caught.value.hint
 
 
+def test_options_are_read_by_the_names_that_an_earlier_version_wrote(tmp_path):
+    path = tmp_path / "recon.toml"
+    path.write_text('[train]\nfar = "off"\nlook = "walk"\n', encoding="utf-8")
+    assert layers.read_settings(path) == {"train": {"background": "off", "brightness": "filmed"}}
+    path.write_text('[train]\nlook = "even"\n', encoding="utf-8")
+    assert layers.read_settings(path) == {"train": {"brightness": "even"}}
+    with pytest.raises(ConfigError) as caught:
+        layers.parse_assignment("train.far=on")
+    assert caught.value.hint == "Give --background, in a file background."
+
+
 def test_an_option_that_is_gone_is_no_assignment():
     with pytest.raises(ConfigError, match=r"--set sets train\.blur, which recon no longer has"):
         layers.parse_assignment("train.blur=on")

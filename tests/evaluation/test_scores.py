@@ -88,12 +88,12 @@ def test_the_table_of_the_paper_sets_two_models_side_by_side_by_data_set():
     ({}, True),
     ({"iterations": 30_000, "images": "denoised", "seed": 4}, True),
     ({"densify": "budget"}, False),
-    ({"far": "on"}, False),
+    ({"background": "on"}, False),
     ({"ssim_weight": 0.0}, False),
     ({"sh_degree": 1}, False),
 ])
 def test_only_the_recipe_of_3dgs_is_the_reference(changes, expected):
-    plain = {"densify": "reference", "far": "off", "stereo": "off", "exposure": "off"}
+    plain = {"densify": "reference", "background": "off", "stereo": "off", "exposure": "off"}
     assert RunConfig(**{**plain, **changes}).is_reference is expected
 
 

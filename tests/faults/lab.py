@@ -41,7 +41,7 @@ max_gaussians = 500
 checkpoint_every = 5
 sh_degree = 1
 images = "original"
-far = "off"
+background = "off"
 stereo = "off"
 exposure = "off"
 [prune]

@@ -139,7 +139,7 @@ def test_after_an_early_stop_it_goes_on_from_the_steps_taken(inputs, tmp_path, m
     assert 132 + 0.6 * 188 < second.stopped_early_at < 132 + 0.8 * 188
     rows = LogRow.read_all(tmp_path / "long" / "log.jsonl")
     assert [row.iteration for row in rows] == sorted({row.iteration for row in rows})
-    assert [row.iteration for row in rows if row.goes_on_at] == [second.stopped_early_at]
+    assert [row.iteration for row in rows if row.skip_to_iteration] == [second.stopped_early_at]
 
 
 def test_few_more_steps_are_said_to_gain_nothing(inputs, finished, tmp_path, caplog):

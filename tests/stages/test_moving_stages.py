@@ -14,12 +14,12 @@ from recon_cli.errors import InputError
 from recon_cli.evaluation.scores import Metrics
 from recon_cli.io.images import write_png
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import moving_search
+from recon_cli.train.parts import moving
 
 pytestmark = pytest.mark.integration
 MASKED = "000002.png"
-CONFIG = RunConfig(iterations=30, densify_every=10, max_gaussians=120, far="off", stereo="off",
-                   exposure="off", validation=0.0)
+CONFIG = RunConfig(iterations=30, densify_every=10, max_gaussians=120, background="off",
+                   stereo="off", exposure="off", validation=0.0)
 
 
 def run(stage, config, inputs, out):
@@ -97,8 +97,8 @@ def test_evaluate_compares_nothing_where_nothing_was_masked(inputs, tmp_path):
 
 def test_held_out_views_are_compared_with_some_of_the_training(monkeypatch):
     seen = []
-    monkeypatch.setattr(moving_search, "compare_view", lambda _splats, view, *_, **__: view)
-    monkeypatch.setattr(moving_search, "find_moving",
+    monkeypatch.setattr(moving, "compare_view", lambda _splats, view, *_, **__: view)
+    monkeypatch.setattr(moving, "find_moving",
                         lambda own, others: seen.append((len(own), len(others))) or [])
-    moving_search.find_in_held_out(None, [], range(300), moving_search.Judge(0, "numba"))
+    moving.find_in_held_out(None, [], range(300), moving.ViewComparer(0, "numba"))
     assert seen == [(0, 60)]

@@ -106,7 +106,7 @@ def test_an_interrupted_one_resumes_and_the_import_stays(workspace, scene, monke
 
 
 @pytest.mark.parametrize(("words", "says"), [
-    (("--max-gaussians", "50"), "has 60 Gaussians"), (("--far", "on"), "far is on")])
+    (("--max-gaussians", "50"), "has 60 Gaussians"), (("--background", "on"), "background is on")])
 def test_options_that_contradict_the_scene_are_refused(workspace, words, says, capsys):
     assert recon("train", workspace, *FURTHER, *words) == 2
     assert says in capsys.readouterr().err

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 ON_TRITON = replace(CONTEXT, backend="triton", device=DEVICE)
 CONFIG = RunConfig(
-    iterations=8, densify_every=4, max_gaussians=80, sh_degree=0, far="off", exposure="off",
+    iterations=8, densify_every=4, max_gaussians=80, sh_degree=0, background="off", exposure="off",
     images="original", checkpoint_every=3, early_stop=False)
 SMALL = Shape(22, 18, 18.0)  # four tiles
 VIEWS = 6  # two of them held out

@@ -17,7 +17,7 @@ from recon_cli.stereo.depths import (
     camera_row,
     find_depths,
     find_partners,
-    places,
+    unproject,
 )
 
 NEAR = 0.05
@@ -121,7 +121,7 @@ def test_places_of_pixels_are_where_their_rays_end():
     depth, expected = wall(view, 0.3)
     pixels = np.array([0, 77, depth.size - 1])
     np.testing.assert_allclose(
-        places(view, depth, pixels), expected.reshape(-1, 3)[pixels], atol=1e-6)
+        unproject(view, depth, pixels), expected.reshape(-1, 3)[pixels], atol=1e-6)
 
 
 # --- level planes -------------------------------------------------------------------------------

@@ -8,10 +8,10 @@ from recon_cli.render import render
 from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train import background
-from recon_cli.train.background import (
+from recon_cli.train.parts import background
+from recon_cli.train.parts.background import (
     faces,
-    far_content,
+    find_background,
     look_at_one_thing,
     project_points,
     splats_of,
@@ -54,7 +54,7 @@ def test_directions_are_even_on_the_sphere():
 
 def test_what_is_seen_through_a_window_lies_far_outside_in_its_colour():
     views, wall = room()
-    content = far_content(views, wall, EXTENT)
+    content = find_background(views, wall, EXTENT)
     assert len(content.positions) > 20
     distance = np.linalg.norm(content.positions, axis=1)
     assert distance.min() > 90 * EXTENT
@@ -67,8 +67,8 @@ def test_what_is_seen_through_a_window_lies_far_outside_in_its_colour():
 
 def test_it_does_not_depend_on_the_size_of_the_images():
     views, wall = room()
-    small = far_content(views, wall, EXTENT)
-    large = far_content([TrainView(
+    small = find_background(views, wall, EXTENT)
+    large = find_background([TrainView(
         view.camera.resized(640, 480), view.image.repeat(4, axis=0).repeat(4, axis=1))
         for view in views], wall, EXTENT)
     assert large.share == pytest.approx(small.share, abs=0.01)
@@ -77,14 +77,14 @@ def test_it_does_not_depend_on_the_size_of_the_images():
 
 def test_a_closed_room_has_no_far_content():
     views, wall = room(window=False)
-    content = far_content(views, wall, EXTENT)
+    content = find_background(views, wall, EXTENT)
     assert (len(content.positions), content.share) == (0, 0.0)
     assert not faces(views[0], content, wall)
 
 
 def test_only_views_that_look_out_face_it():
     views, wall = room()
-    content = far_content(views, wall, EXTENT)
+    content = find_background(views, wall, EXTENT)
     assert faces(views[0], content, wall)
     away = views[0].camera.viewmat.copy()
     away[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ away[:3, :3]
@@ -94,18 +94,18 @@ def test_only_views_that_look_out_face_it():
 
 def test_one_view_alone_cannot_tell():
     views, wall = room()
-    assert len(far_content(views[:1], wall, EXTENT).positions) == 0
+    assert len(find_background(views[:1], wall, EXTENT).positions) == 0
 
 
 def test_a_mask_hides_what_lies_far_outside():
     views, wall = room()
     hidden = [TrainView(view.camera, view.image, np.zeros((120, 160), bool)) for view in views]
-    assert len(far_content(hidden, wall, EXTENT).positions) == 0
+    assert len(find_background(hidden, wall, EXTENT).positions) == 0
 
 
 def test_its_gaussians_close_the_window_and_have_no_parallax():
     views, wall = room()
-    splats = splats_of(far_content(views, wall, EXTENT), 0)
+    splats = splats_of(find_background(views, wall, EXTENT), 0)
     pictures = []
     for view in (views[0], views[-1]):
         with torch.no_grad():
@@ -158,7 +158,7 @@ def framed(behind=False):
 
 def test_a_blank_part_of_a_wall_gets_points_at_the_depth_around_it_in_its_colour():
     views, points = framed()
-    content = far_content(views, points, EXTENT)
+    content = find_background(views, points, EXTENT)
     gaps, colors = content.gap_points, content.gap_colors
     assert np.allclose(gaps[:, 2], 3, atol=1e-9)
     assert (np.abs(gaps[:, 0]) < 1.1).all()
@@ -171,9 +171,9 @@ def test_a_blank_part_of_a_wall_gets_points_at_the_depth_around_it_in_its_colour
 
 def test_a_gap_is_dropped_where_views_show_points_beyond(monkeypatch):
     views, points = framed(behind=True)
-    kept = far_content(views, points, EXTENT).gap_points
+    kept = find_background(views, points, EXTENT).gap_points
     monkeypatch.setattr(background, "_THROUGH_SHARE", 1.0)
-    found = far_content(views, points, EXTENT).gap_points
+    found = find_background(views, points, EXTENT).gap_points
     shown = np.zeros(len(found))
     for view in views:
         camera = view.camera.resized(150, 112)
@@ -188,16 +188,16 @@ def test_a_gap_is_dropped_where_views_show_points_beyond(monkeypatch):
 
 def test_gaps_need_two_views_points_around_and_views_of_more_than_one_thing():
     views, points = framed()
-    assert len(far_content(views[:1], points, EXTENT).gap_points) == 0
-    assert len(far_content(views, points[:5], EXTENT).gap_points) == 0
+    assert len(find_background(views[:1], points, EXTENT).gap_points) == 0
+    assert len(find_background(views, points[:5], EXTENT).gap_points) == 0
     around = [TrainView(Camera(160, 120, 100.0, 100.0, 80.0, 60.0, looking_at(
         np.array([np.sin(angle), 0, 3 - 3 * np.cos(angle)]), np.array([0.0, 0, 3]),
         np.array([0.0, -1, 0]))), views[0].image) for angle in np.linspace(-0.6, 0.6, 5)]
     assert look_at_one_thing(around)
-    assert len(far_content(around, points, EXTENT).gap_points) == 0
+    assert len(find_background(around, points, EXTENT).gap_points) == 0
 
 
 def test_a_mask_hides_gaps():
     views, points = framed()
     hidden = [TrainView(view.camera, view.image, np.zeros((120, 160), bool)) for view in views]
-    assert len(far_content(hidden, points, EXTENT).gap_points) == 0
+    assert len(find_background(hidden, points, EXTENT).gap_points) == 0

@@ -16,10 +16,11 @@ from recon_cli.render.contract import StepOptions
 from recon_cli.render.depth_loss import depth_loss
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.train_view import SensorDepth, TrainView
-from recon_cli.train.feature_trials import examine
 from recon_cli.train.fit import fit
 from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_loss
 from recon_cli.train.initialize import first_state as begin_at
+from recon_cli.train.parts.table import step_options
+from recon_cli.train.parts.trials import examine
 from recon_cli.train.schedule import Schedule, make_schedule
 from recon_cli.train.state import new_state
 
@@ -116,7 +117,7 @@ def test_samples_fall_into_the_pixels_of_any_size_and_none_under_a_mask():
 def blank_wall(depth):
     """The task of a wall of one grey, which images alone do not place, and its Gaussians."""
     scene = wall_scene(config=replace(
-        WALL_CONFIG, depth=depth, iterations=200, far="off", stereo="off", exposure="off",
+        WALL_CONFIG, depth=depth, iterations=200, background="off", stereo="off", exposure="off",
         means_rate=3e-3))
     grey = [TrainView(view.camera, np.full_like(view.image, 128),
                       depth=sensor(view.camera, np.full(view.image.shape[:2], 2.0)))
@@ -172,7 +173,7 @@ def test_a_run_that_is_to_do_without_depth_keeps_its_bytes():
 @pytest.mark.integration
 def test_depth_that_fits_is_on_and_depth_that_spoils_the_images_is_off(monkeypatch):
     # At its own weight, depth that is wrong by a third costs this wall less than another seed.
-    monkeypatch.setattr("recon_cli.train.schedule._DEPTH_WEIGHT", 0.05)
+    monkeypatch.setattr("recon_cli.train.parts.depth._WEIGHT", 0.05)
     scene = wall_scene()
     assert examine(scene).config.depth == "off"
     assert not [one for one in examine(scene).decisions if one.name == "depth"]
@@ -188,7 +189,7 @@ def test_depth_that_fits_is_on_and_depth_that_spoils_the_images_is_off(monkeypat
 
 
 def test_depth_that_does_not_fit_the_model_is_off_and_says_why():
-    scene = wall_scene(config=replace(WALL_CONFIG, far="off", exposure="off"))
+    scene = wall_scene(config=replace(WALL_CONFIG, background="off", exposure="off"))
     needs = examine(replace(scene, task=replace(
         scene.task, depth_refused="it differs from the points of the model by 31%")))
     assert needs.config.depth == "off"
@@ -196,13 +197,17 @@ def test_depth_that_does_not_fit_the_model_is_off_and_says_why():
         "it differs from the points of the model by 31%"]
 
 
+def depth_weight(schedule, step):
+    return step_options(schedule, step)["depth_weight"]
+
+
 def test_the_weight_falls_over_the_run_and_leaves_every_other_step_to_the_images():
     schedule = Schedule(RunConfig(iterations=1000, depth="on"))
-    weights = [schedule.depth_weight(step) for step in range(1, 1001)]
+    weights = [depth_weight(schedule, step) for step in range(1, 1001)]
     assert not any(weights[::2])
     assert weights[1] > 10 * weights[-1] > 0
     assert sorted(weights[1::2], reverse=True) == weights[1::2]
-    assert not any(Schedule(RunConfig(iterations=1000, depth=word)).depth_weight(2)
+    assert not any(depth_weight(Schedule(RunConfig(iterations=1000, depth=word)), 2)
                    for word in ("auto", "off"))
     later = make_schedule(RunConfig(iterations=1200, depth="on"), 1000)
-    assert later.depth_weight(1002) == pytest.approx(weights[-1])
+    assert depth_weight(later, 1002) == pytest.approx(weights[-1])

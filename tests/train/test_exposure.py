@@ -10,10 +10,10 @@ from recon_cli.io.images import fill_masked
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
-from recon_cli.render.response import Response
+from recon_cli.render.response import Response, ResponseGradient
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.exposure import Exposure
 from recon_cli.train.gradient import gradient_step, photometric_loss
+from recon_cli.train.parts.exposure import Exposure
 from recon_cli.train.state import new_state
 
 # Gradients of float32 against float64, relative in the 2-norm, as in test_gradient.
@@ -131,12 +131,16 @@ def test_a_view_that_is_ignored_altogether_has_no_gradient_of_the_gain():
     assert not step_of(splats, view, "numba", GAIN)[2].any()
 
 
+def pull(log_gain):
+    return ResponseGradient(log_gain, np.zeros(2))
+
+
 def stepped(exposure, steps=300, images=4, seed=0):
     """Pulls the log-gains of the first images towards a truth by the sign of what is missing."""
     truth = np.random.default_rng(seed).normal(0, 0.2, (images, 3))
     for i in range(steps):
         image = i % images
-        exposure.step(image, exposure.log_gains[image] - truth[image], i / steps)
+        exposure.step(image, pull(exposure.log_gains[image] - truth[image]), i / steps)
     return truth
 
 
@@ -161,7 +165,7 @@ def test_an_image_that_is_never_seen_keeps_its_gain():
 
 def test_a_gradient_that_is_not_finite_moves_nothing():
     exposure = Exposure(2)
-    exposure.step(0, np.array([np.nan, 0.0, 1.0]), 0.0)
+    exposure.step(0, pull(np.array([np.nan, 0.0, 1.0])), 0.0)
     assert not exposure.log_gains.any()
 
 

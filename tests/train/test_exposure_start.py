@@ -11,7 +11,7 @@ from recon_cli.datasets.depth_points import points_from_depth
 from recon_cli.datasets.layouts import read_posed
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.exposure import estimate_gains
+from recon_cli.train.parts.sparse_points import estimate_gains
 
 pytestmark = pytest.mark.integration
 

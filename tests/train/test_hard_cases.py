@@ -11,14 +11,14 @@ from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.feature_trials import examine
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state
+from recon_cli.train.parts.trials import examine
 from recon_cli.train.schedule import Schedule
 
 STEPS = 200
 PLAIN = replace(
-    CONFIG, iterations=STEPS, densify_every=20, far="off", exposure="off",
+    CONFIG, iterations=STEPS, densify_every=20, background="off", exposure="off",
     early_stop=False)
 
 
@@ -145,6 +145,6 @@ def test_nothing_of_the_scene_in_any_view_leaves_the_first_gaussians():
 
 def test_a_scene_of_few_views_is_examined_and_trained():
     needs = examine(scene(window=True, views=4))
-    assert needs.config.far == "off"
+    assert needs.config.background == "off"
     candidate = scene(views=4)
     assert psnr(trained(candidate), candidate.task.train) > 20

@@ -15,8 +15,8 @@ from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import SH_C0
 from recon_cli.train.fit import fit
 from recon_cli.train.initialize import first_state, restore_state, splats_from_points
+from recon_cli.train.parts.stereo import SurfacePoints
 from recon_cli.train.state import save_state
-from recon_cli.train.stereo_points import SurfacePoints
 
 GRID = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
 GREY = np.full((27, 3), 128, np.uint8)
@@ -62,7 +62,7 @@ def test_surfaces_by_stereo_begin_with_gaussians_where_sparse_points_leave_room(
         stereo, cap, more):
     surfaces = SurfacePoints(GRID[:3] + 20.0, np.full((3, 3), 200, np.uint8))
     task = tiny_task(replace(CONFIG, stereo=stereo, max_gaussians=cap))
-    task = replace(task, stereo=SimpleNamespace(search=lambda _: surfaces))
+    task = replace(task, evidence=SimpleNamespace(points=GRID, once=lambda *_: surfaces))
     splats = first_state(task, GRID, GREY, most=100).splats
     assert len(splats) == 27 + more
     added = splats.means.detach().numpy()[27:]
@@ -71,14 +71,9 @@ def test_surfaces_by_stereo_begin_with_gaussians_where_sparse_points_leave_room(
 
 
 def test_without_room_no_surface_is_searched():
-    class Unsearched:
-        @property
-        def found(self):
-            raise AssertionError("searched")
-
-    task = tiny_task(replace(CONFIG, stereo="on", max_gaussians=1000))
-    task = replace(task, stereo=Unsearched())
     points = np.random.default_rng(0).normal(size=(600, 3))
+    task = tiny_task(replace(CONFIG, stereo="on", max_gaussians=1000))
+    task = replace(task, evidence=SimpleNamespace(points=points))  # which cannot be searched
     first_state(task, points, np.full((600, 3), 90, np.uint8), most=500)
 
 

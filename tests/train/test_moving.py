@@ -1,147 +1,122 @@
-"""Regions that contradict other views, in views of a plane whose depth is known in every pixel."""
+"""A board that is carried past a wall is found by short runs and masked where that pays."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from wall_scene import CONFIG, scene
 
-from recon_cli.scene.camera import Camera
-from recon_cli.train import moving
-from recon_cli.train.moving import ComparedView, find_moving
+from recon_cli.train.masks import enlarge, hide
+from recon_cli.train.parts.moving import have_evidence, is_plausible, share_of
+from recon_cli.train.parts.trials import examine
 
-H, W = 84, 150
-NOISE = np.random.default_rng(0).normal(0, 0.004, (12, H, W, 3)).astype(np.float32)
-
-
-def camera(shift):
-    viewmat = np.eye(4)
-    viewmat[0, 3] = -shift  # the cameras stand beside each other and look at the plane z = 3
-    return Camera(W, H, 120.0, 120.0, W / 2, H / 2, viewmat)
+PARTS = {
+    "background": "off", "stereo": "off", "exposure": "off", "vignette": "off", "iterations": 1000}
 
 
-def views():
-    return [ComparedView(camera(0.05 * row), noise.copy(), np.full((H, W), 3.0, np.float32),
-                         np.ones((H, W), bool)) for row, noise in enumerate(NOISE)]
+def carried(views, *, size=(50, 26), every=1):
+    """Returns views in some of which a red board is carried across, and where it is."""
+    made, boards = [], []
+    for row, view in enumerate(views):
+        board = np.zeros((96, 128), bool)
+        if 8 <= row < 17 and row % every == 0:
+            left = 6 + 11 * (row - 8)
+            board[20:20 + size[0], left:left + size[1]] = True
+        image = view.image.copy()
+        image[board] = 200, 20, 20
+        made.append(replace(view, stored=image))
+        boards.append(board)
+    return made, boards
 
 
-def paint(view, lines, columns, error):
-    view.error[lines, columns] += np.float32(error)
+def with_views(made, views, **config):
+    task = made.task
+    schedule = replace(task.schedule, config=replace(task.schedule.config, **config))
+    return replace(made, task=replace(task, train=views, schedule=schedule))
 
 
-def area(regions):
-    return [round(float(region.mean()), 3) for region in regions]
+def decision(needs):
+    return next(one for one in needs.decisions if one.name == "moving")
 
 
-def test_nothing_is_found_where_nothing_moves():
-    assert not any(area(find_moving(views())))
+@pytest.mark.integration
+def test_what_is_carried_past_is_masked_and_little_else():
+    made = scene()
+    views, boards = carried(made.task.train)
+    needs = examine(with_views(made, views, **PARTS, moving="auto"))
+    assert decision(needs).on, decision(needs).reason
+    hidden = missed = spared = 0
+    for region, board in zip(needs.masks, boards, strict=True):
+        large = enlarge(region, 128, 96)
+        hidden += int((large & board).sum())
+        missed += int((board & ~large).sum())
+        spared += int((large & ~board).sum())
+    assert hidden > 0.95 * (hidden + missed)
+    assert spared < 0.03 * 96 * 128 * len(views)
 
 
-def test_a_person_in_few_views_is_found_with_little_around():
-    some = views()
-    for row in (4, 5, 6):
-        paint(some[row], slice(20, 70), slice(30 + 20 * row - 80, 50 + 20 * row - 80), 0.4)
-    found = find_moving(some)
-    for row, region in enumerate(found):
-        painted = np.zeros((H, W), bool)
-        if row in (4, 5, 6):
-            painted[20:70, 20 * row - 50:20 * row - 30] = True
-            assert region[painted].all()
-            assert (region & ~painted).mean() < 0.03  # its margin
-        else:
-            assert not region.any()
+@pytest.mark.integration
+def test_off_looks_for_nothing_and_on_skips_the_trial():
+    made = scene()
+    views, _ = carried(made.task.train)
+    needs = examine(with_views(made, views, **PARTS, moving="off"))
+    assert needs.masks is None
+    assert needs.decisions == ()
+    needs = examine(with_views(made, views, **PARTS, moving="on"))
+    assert needs.masks is not None
+    assert decision(needs).mean_db is None
 
 
-def test_an_error_that_all_views_share_is_one_of_the_model():
-    some = views()
-    for row, view in enumerate(some):  # one place of the plane
-        column = round(75 - 120 * 0.05 * row / 3)
-        paint(view, slice(20, 60), slice(column - 10, column + 10), 0.4)
-    assert not any(area(find_moving(some)))
+@pytest.mark.integration
+def test_a_clean_wall_gets_no_mask():
+    needs = examine(scene(config=replace(CONFIG, **PARTS, moving="auto")))
+    assert needs.masks is None
+    assert decision(needs).reason == "0 of 26 views contradict the others"
 
 
-def test_an_error_of_most_views_is_dropped_though_each_contradicts_some():
-    some, signs = views(), [1, -1] * 6
-    for row, (view, sign) in enumerate(zip(some, signs, strict=True)):
-        column = round(75 - 120 * 0.05 * row / 3)
-        paint(view, slice(20, 60), slice(column - 10, column + 10), 0.4 * sign)
-    assert not any(area(find_moving(some)))
+@pytest.mark.parametrize("config", [{"densify": "reference"}, {"iterations": 999}])
+def test_the_reference_recipe_and_short_runs_do_not_look(config):
+    made = scene()
+    views, _ = carried(made.task.train)
+    needs = examine(with_views(made, views, **{**PARTS, "moving": "auto", **config}))
+    assert needs.masks is None
+    assert "moving" not in [one.name for one in needs.decisions]
 
 
-@pytest.mark.parametrize(("lines", "columns", "error"), [
-    (slice(20, 23), slice(20, 24), 0.5),  # small
-    (slice(40, 41), slice(0, 140), 0.5),  # thin
-    (slice(20, 60), slice(40, 70), 0.05),  # faint
-])
-def test_small_thin_and_faint_errors_are_not_regions(lines, columns, error):
-    some = views()
-    paint(some[5], lines, columns, error)
-    assert not any(area(find_moving(some)))
+@pytest.mark.parametrize(("found", "of", "enough"), [
+    (0, 60, False), (4, 60, False), (5, 60, True), (2, 20, False), (3, 20, True)])
+def test_a_twelfth_of_the_views_must_show_what_moves_and_three_at_least(found, of, enough):
+    assert have_evidence(np.arange(of) < found) == enough
 
 
-def test_a_shadow_that_touches_a_person_belongs_to_the_region():
-    some = views()
-    paint(some[5], slice(20, 60), slice(60, 80), 0.4)
-    paint(some[5], slice(60, 70), slice(55, 95), -0.09)
-    assert find_moving(some)[5][62:68, 60:90].all()
+@pytest.mark.integration
+def test_a_board_in_two_views_is_no_sign():
+    made = scene()
+    views, boards = carried(made.task.train)
+    views = [view if row in (10, 12) else old
+             for row, (view, old) in enumerate(zip(views, made.task.train, strict=True))]
+    assert boards[10].any()
+    needs = examine(with_views(made, views, **PARTS, moving="auto"))
+    assert needs.masks is None
+    assert decision(needs).reason == "2 of 26 views contradict the others"
 
 
-def test_a_faint_part_far_from_the_strong_one_is_left():
-    some = views()
-    paint(some[5], slice(20, 60), slice(20, 40), 0.4)
-    paint(some[5], slice(30, 34), slice(40, 130), -0.09)
-    found = find_moving(some)[5]
-    assert found[31:33, 40:54].all()  # a shadow of .12 of the longer side
-    assert not found[:, 64:].any()
+def test_regions_hide_pixels_on_top_of_a_mask():
+    view = scene(views=2).task.train[0]
+    upper = np.ones((96, 128), bool)
+    upper[:20] = False
+    region = np.zeros((48, 64), bool)
+    region[:, :32] = True
+    hidden, = hide([replace(view, mask=upper)], [region])
+    assert not hidden.mask[:20].any()
+    assert not hidden.mask[:, :63].any()
+    assert hidden.mask[20:, 65:].all()
+    assert hide([view], [np.zeros((48, 64), bool)]) == [view]
 
 
-def test_a_view_that_fits_its_render_is_not_compared():
-    some = views()
-    assert not any(moving.find_suspects(view, 0.004).any() for view in some)
-    paint(some[5], slice(20, 60), slice(60, 80), 0.4)
-    suspects = moving.find_suspects(some[5], 0.004)
-    assert suspects[20:60, 60:80].all()
-    assert suspects.mean() < 0.1
-
-
-@pytest.mark.parametrize(("agreed", "found"), [(12, False), (5, True)])
-def test_where_others_disagree_a_region_is_only_found_once_it_is_likely(agreed, found):
-    amount, spread = np.zeros((H, W), np.float32), np.zeros((H, W), np.float32)
-    amount[20:60, 60:80], spread[20:60, 60:80] = 0.3, 0.03
-    contradiction = moving.Contradiction(amount, spread, np.full((H, W), 8))
-    assert moving.find_regions(contradiction, 0.01, agreed).any() == found
-
-
-def test_what_too_few_others_see_is_not_judged():
-    some = views()[:3]
-    paint(some[1], slice(20, 60), slice(60, 80), 0.4)
-    assert not any(area(find_moving(some)))
-
-
-def test_surfaces_hidden_from_others_are_not_judged():
-    some = views()
-    near = np.full((H, W), 1.0, np.float32)  # others look at something in front
-    some = [view if row == 5 else replace(view, depth=near) for row, view in enumerate(some)]
-    paint(some[5], slice(20, 60), slice(60, 80), 0.4)
-    assert not any(area(find_moving(some)))
-
-
-def test_a_capture_whose_model_is_poor_is_not_judged():
-    some = [replace(view, error=10 * view.error) for view in views()]
-    paint(some[5], slice(20, 60), slice(60, 80), 0.6)
-    assert moving.noise_level(some) > moving._TOO_NOISY
-    assert not any(area(find_moving(some)))
-
-
-def test_held_out_views_are_judged_by_the_others():
-    some = views()
-    paint(some[5], slice(20, 60), slice(60, 80), 0.4)
-    found, = find_moving([some[5]], [*some[:5], *some[6:]])
-    assert found[25:55, 62:78].all()
-
-
-def test_the_median_gain_of_a_view_ignores_a_third_of_other_content():
-    rgb = np.random.default_rng(1).uniform(0.2, 0.6, (30, 30, 3)).astype(np.float32)
-    photo = rgb * np.float32([1.1, 0.9, 1.2])
-    photo[:9] = 0.9
-    gain = moving._median_gain(rgb, photo, np.ones((30, 30), bool))
-    assert gain == pytest.approx([1.1, 0.9, 1.2], rel=0.02)
+def test_more_than_a_quarter_is_not_plausible():
+    half = np.zeros((10, 10), bool)
+    half[:5] = True
+    assert share_of([half, half & False]) == 0.25
+    assert is_plausible([half, half & False])
+    assert not is_plausible([half, half])

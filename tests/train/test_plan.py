@@ -15,11 +15,11 @@ from recon_cli.errors import ConfigError
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import plan
 from recon_cli.train.cost import CostModel, LevelCost
-from recon_cli.train.feature_trials import Needs
+from recon_cli.train.parts.decisions import NO_TIME, skip_trial
+from recon_cli.train.parts.stereo import SurfacePoints
+from recon_cli.train.parts.trials import Needs
 from recon_cli.train.plan import QUALITIES, Facts, make_plan
-from recon_cli.train.stereo_points import SurfacePoints
 from recon_cli.train.train_data import read_config
-from recon_cli.train.trial_decisions import NO_TIME, skip_trial
 from recon_cli.workspace.summaries import TrainPlan
 
 FACTS = Facts(detail=60_000, views=40, points=9000, room=10**9)
@@ -68,7 +68,9 @@ class FakeClock:
     def photos(self, seconds, views=60):
         """Stands for a search in so many views, which takes so many seconds unless it is cut."""
         class Search:
-            def search(_, deadline=None):  # noqa: N805
+            points = np.zeros((9000, 3))
+
+            def once(_, _search, deadline=None):  # noqa: N805
                 pace = (deadline or Deadline()).keep_pace(views)
                 for done in range(1, views + 1):
                     self.now += seconds / views
@@ -83,7 +85,7 @@ def planned(tmp_path, monkeypatch, *, minutes, trials=0.0, surfaces=0.0, loading
     """The plan, notices and seconds before the first step of a run whose parts take so long."""
     clock, notices = FakeClock(), []
     task = tiny_task(RunConfig(stereo="on"))
-    task = replace(task, train=20 * task.train, stereo=clock.photos(surfaces))
+    task = replace(task, train=20 * task.train, evidence=clock.photos(surfaces))
     scene = SimpleNamespace(
         train=(), validation=(), points=np.zeros((9000, 3)), colors=np.zeros((9000, 3), np.uint8))
 

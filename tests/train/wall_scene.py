@@ -10,7 +10,7 @@ from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.feature_trials import TrialScene
+from recon_cli.train.parts.part import TrialScene
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
 

@@ -1,4 +1,6 @@
-"""What sparse points show of vignettes, before any training.
+"""Vignettes: the falloff of each camera's lens, and what sparse points show of it before training.
+
+A vignette takes nothing away at the principal point.
 
 A point has one colour. The logarithm of its brightness in view f at squared distance s from the
 principal point is, by `render.response` to the first order,
@@ -12,17 +14,26 @@ contradicts the others: it is hidden there, or gloss.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from recon_cli.render.response import Response, ResponseGradient, lens
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.background import project_points
-from recon_cli.train.exposure import choose_points, log_colors
-from recon_cli.train.photometry import camera_groups, falling
+from recon_cli.train.parts.decisions import Rule
+from recon_cli.train.parts.part import Part, Sign, TrialScene
+from recon_cli.train.parts.photometry import FittedPart
+from recon_cli.train.parts.sparse_points import choose_points, log_colors, project_points
+from recon_cli.train.task import Evidence, Task
+from recon_cli.workspace.summaries import PhotometrySummary, VignetteSummary
 
+_RATE, _FALL = 0.002, 0.1  # of the exponents; it falls to a tenth, as that of exposures does
+_DARKEST = 1.5  # of -(a + b): a corner with a fifth of the light, as of a fast lens wide open
 _LEAST_VIEWS = 3  # that a point needs to say anything
 _ROUNDS = 4  # of weights
 _DOUBT = 1.5  # times the median residual, from which weights fall
@@ -137,3 +148,81 @@ def _normal_equations(
     noise = max(float((weights * rest**2).sum() / max(weights.sum(), 1e-12)), 1e-8)
     normal[own[1], own[1]] += np.eye(views) * noise / _BEND_PRIOR**2
     return normal, right
+
+
+class Vignettes(FittedPart):
+    """The vignettes of the cameras of a capture."""
+
+    def __init__(
+        self, cameras: Sequence[Camera], *, start: NDArray[np.float64] | None = None
+    ) -> None:
+        self._groups = camera_groups(cameras)
+        self._lenses = list(dict.fromkeys(map(lens, cameras)))
+        first = np.zeros((max(self._groups) + 1, 2)) if start is None else start
+        super().__init__("vignette", np.array([falling(*row) for row in first]))
+
+    @property
+    def exponents(self) -> NDArray[np.float64]:
+        """a and b of all cameras, [G, 2]; a copy."""
+        return self._rows.value.numpy().copy()
+
+    def of_image(self, image: int) -> tuple[float, float]:
+        """Returns a and b of a training image."""
+        a, b = self._rows.value[self._groups[image]].tolist()
+        return a, b
+
+    def respond(self, image: int, response: Response) -> Response:
+        """Returns the response of an image with the vignette of its camera."""
+        return replace(response, vignette=self.of_image(image))
+
+    def step(self, image: int, gradient: ResponseGradient, done: float) -> None:
+        """Moves the vignette of one image's camera; the rate falls as `done` goes from 0 to 1."""
+        row = self._groups[image]
+        self._rows.step(row, gradient.vignette, _RATE * _FALL**done)
+        self._rows.value[row] = torch.tensor(
+            falling(*self._rows.value[row].tolist()), dtype=torch.float64)
+
+    def add_to(self, summary: PhotometrySummary) -> PhotometrySummary:
+        """Returns the record with the vignettes by lens."""
+        return replace(summary, vignettes=tuple(
+            VignetteSummary(lens=key, a=a, b=b, corner=round(math.exp(a + b), 4))
+            for key, (a, b) in zip(self._lenses, self._rows.value.tolist(), strict=True)))
+
+
+def camera_groups(cameras: Sequence[Camera]) -> list[int]:
+    """Returns the number of the camera of each view, in order of their first views."""
+    numbers: dict[tuple[float, ...], int] = {}
+    return [numbers.setdefault(lens(camera), len(numbers)) for camera in cameras]
+
+
+def falling(a: float, b: float) -> tuple[float, float]:
+    """Returns exponents of a vignette that nowhere rises, the nearest in a and then in b.
+
+    a s + b s^2 falls for all s from 0 to 1 where its slope a + 2 b s is not positive at both ends.
+    """
+    a = min(a, 0.0)
+    b = min(b, -a / 2)
+    scale = min(1.0, _DARKEST / max(-(a + b), 1e-12))
+    return a * scale, b * scale
+
+
+def _find(evidence: Evidence) -> VignetteEvidence:
+    return find_vignettes(evidence.views, evidence.points)
+
+
+def find_dark_corners(scene: TrialScene) -> Sign:
+    """Returns whether corners of the views lack light."""
+    if scene.config.densify == "reference":
+        return Sign(on=False)  # sees what tables of the literature saw
+    found = scene.evidence.once(_find)
+    return Sign() if found.shades else Sign(
+        on=False,
+        reason=f"the corners of the views lack {100 * found.corner_loss:.1f}% of the light only")
+
+
+def _fit(task: Task, points: NDArray[np.float64] | None) -> Vignettes:
+    start = None if points is None else find_vignettes(task.train, points).exponents
+    return Vignettes([view.camera for view in task.train], start=start)
+
+
+PART = Part("vignette", find_dark_corners, rule=lambda _: Rule(as_filmed=True), fit=_fit)

@@ -15,11 +15,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train import async_trainer
-from recon_cli.train.exposure import Exposure
+from recon_cli.train import stepper
 from recon_cli.train.fit import fit
 from recon_cli.train.importance import Importance
-from recon_cli.train.photometry import Photometry
+from recon_cli.train.parts.exposure import Exposure
+from recon_cli.train.parts.photometry import Photometry
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.state import load_state, new_state, save_state
 from recon_cli.train.stepper import Stepper
@@ -295,7 +295,7 @@ def test_steps_of_several_views_go_ahead_to_the_same_bits(monkeypatch):
 def test_a_step_never_waits_for_the_device(views):
     config = dataclasses.replace(CONFIG, batch_views=views)
     state, task = first(config=config), task_of(config=config)
-    steps = async_trainer.AsyncTrainer(state, task, lambda _: False)
+    steps = stepper.AsyncStepper(state, task, lambda _: False)
     steps._start()
     with NoWaiting():
         steps._start()
@@ -307,12 +307,12 @@ def test_whoever_must_know_more_after_each_step_takes_them_one_by_one():
     def chosen(backend="triton", importance=None, *, exposure=False, **changes):
         config = dataclasses.replace(CONFIG, **changes)
         state, task = first(backend, config), task_of(backend, config)
-        state.photometry = Photometry.from_parts(Exposure(3) if exposure else None, None)
-        found = async_trainer.choose_trainer(state, task, importance, lambda _: False)
+        state.photometry = Photometry([Exposure(3)]) if exposure else None
+        found = stepper.choose_stepper(state, task, importance, lambda _: False)
         return type(found.__self__)
 
-    assert chosen() is async_trainer.AsyncTrainer
+    assert chosen() is stepper.AsyncStepper
     assert chosen("numba") is Stepper
     assert chosen(importance=Importance.zeros(COUNT, torch.device("cpu"))) is Stepper
     assert chosen(exposure=True) is Stepper
-    assert chosen(batch_views=2) is async_trainer.AsyncTrainer
+    assert chosen(batch_views=2) is stepper.AsyncStepper

@@ -8,7 +8,7 @@ import pytest
 from recon_cli.render.response import Response, ResponsePass
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.vignette_evidence import find_vignettes
+from recon_cli.train.parts.vignette import find_vignettes
 
 WIDTH, HEIGHT, DEPTH = 120, 90, 3.0
 CAMERA = Camera(WIDTH, HEIGHT, 100.0, 100.0, WIDTH / 2, HEIGHT / 2, np.eye(4))

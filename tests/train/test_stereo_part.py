@@ -1,35 +1,29 @@
 """Points on a painted wall whose place is known, and when there are none."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from walls import AROUND, camera, grain, shading, views_of
 
-from recon_cli.progress import NullProgress
 from recon_cli.scene.covisibility import observe_points
-from recon_cli.train import stereo_points
-from recon_cli.train.stereo_points import (
-    SparseModel,
-    StereoPoints,
-    SurfacePoints,
-    find_surfaces,
-)
+from recon_cli.train.parts import stereo
+from recon_cli.train.parts.stereo import SurfacePoints, find_surfaces
+from recon_cli.train.task import Evidence
 
 # along the edges of a wall whose middle has no texture
 EDGE = np.array([[3.0, y, z] for y in np.linspace(-1.6, 1.6, 40) for z in (-1.1, 1.1)])
 
 
-def model(points, cameras=AROUND):
-    """A sparse model whose points every view has a track of that has them in its image."""
+def tracks_of(points, cameras=AROUND):
+    """Tracks of points in every view that has them in its image."""
     seen = observe_points(points, cameras).matrix.toarray() > 0
-    return SparseModel(points, [np.flatnonzero(row) for row in seen])
+    return [np.flatnonzero(row) for row in seen]
 
 
-def found(points=EDGE, paint=shading, cameras=AROUND, sparse=None):
-    return find_surfaces(
-        views_of(cameras, paint), sparse or model(points, cameras), NullProgress())
+def found(points=EDGE, paint=shading, cameras=AROUND, tracks=None):
+    tracks = tracks or tracks_of(points, cameras)
+    return find_surfaces(Evidence(views_of(cameras, paint), points, 1.0, lambda: tracks))
 
 
 @cache
@@ -45,7 +39,7 @@ def test_they_lie_on_the_wall_one_in_a_cell(paint):
     assert np.median(np.abs(surfaces.points[:, 0] - 3)) < 0.03
     assert np.mean(np.abs(surfaces.points[:, 0] - 3) < 0.1) > 0.95
     depths = [EDGE[seen] @ view.viewmat[2, :3] + view.viewmat[2, 3]
-              for view, seen in zip(AROUND, model(EDGE).seen, strict=True)]
+              for view, seen in zip(AROUND, tracks_of(EDGE), strict=True)]
     cells = np.floor(surfaces.points / (np.median(np.concatenate(depths)) / 25))
     assert len(np.unique(cells, axis=0)) == len(cells)
 
@@ -64,15 +58,13 @@ def test_a_cell_with_a_sparse_point_gets_none():
 
 def test_without_tracks_points_in_the_image_tell_the_depth():
     nothing = [np.empty(0, np.int64)] * len(AROUND)
-    untold = found(sparse=SparseModel(EDGE, nothing))
-    assert untold.points.tolist() == found_on(shading).points.tolist()
+    assert found(tracks=nothing).points.tolist() == found_on(shading).points.tolist()
 
 
 def test_a_view_that_sees_few_points_is_left_out():
-    whole = model(EDGE)
-    seen = [*whole.seen[:-1], whole.seen[-1][:3]]
+    *others, last = tracks_of(EDGE)
     rest = found(cameras=AROUND[:-1])
-    assert found(sparse=replace(whole, seen=seen)).points.tolist() == rest.points.tolist()
+    assert found(tracks=[*others, last[:3]]).points.tolist() == rest.points.tolist()
 
 
 @pytest.mark.parametrize("points", [EDGE[:5], np.empty((0, 3))])
@@ -90,7 +82,7 @@ def test_views_from_one_place_find_nothing():
 def test_what_one_view_finds_alone_does_not_count(monkeypatch):
     depths = [np.zeros((120, 160), np.float32) for _ in AROUND]
     depths[0][:] = 3.0
-    monkeypatch.setattr(stereo_points, "find_depths", lambda *_: depths)
+    monkeypatch.setattr(stereo, "find_depths", lambda *_: depths)
     assert len(found().points) == 0
     depths[2][:] = 3.0
     assert len(found().points) > 0
@@ -98,11 +90,15 @@ def test_what_one_view_finds_alone_does_not_count(monkeypatch):
 
 def test_they_are_searched_once_and_only_when_asked_for():
     asked = []
-    stereo = StereoPoints(
-        views_of(AROUND, grain), lambda: asked.append(1) or model(EDGE), NullProgress())
+    evidence = Evidence(views_of(AROUND, grain), EDGE, 1.0,
+                        lambda: asked.append(1) or tracks_of(EDGE))
     assert asked == []
-    assert stereo.search() is stereo.search()
+    assert evidence.once(find_surfaces) is evidence.once(find_surfaces)
     assert asked == [1]
+
+
+def test_without_any_model_of_sfm_nothing_is_searched():
+    assert len(find_surfaces(Evidence(views_of(AROUND, grain), EDGE, 1.0)).points) == 0
 
 
 def test_of_more_than_there_is_room_for_a_seeded_draw_is_taken():

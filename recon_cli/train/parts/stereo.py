@@ -6,20 +6,22 @@ in front of it or behind: the views of the path look right, others do not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import compress, count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.deadline import Deadline
-from recon_cli.io.images import reduce_view
-from recon_cli.progress import Progress
+from recon_cli.io.images import reduce_to
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import StereoView, find_depths, find_partners, places
-from recon_cli.train.exposure import estimate_gains
+from recon_cli.stereo.depths import StereoView, find_depths, find_partners, unproject
+from recon_cli.train.parts.part import Part, Sign, Start
+from recon_cli.train.parts.sparse_points import estimate_gains
+from recon_cli.train.task import Evidence, Task
 
 _VIEWS = 60  # searched, evenly spread
 _SIDE = 300  # pixels of their longer side
@@ -33,6 +35,8 @@ _NEAR = 0.02  # of the median depth; nothing nearer to a camera is a surface
 _CELL = 1 / 25
 _AGREE = 2  # views that find a surface in a cell
 _HALF = 1 << 20  # cells on each side of the origin
+
+logger = logging.getLogger("recon")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,34 +59,7 @@ class SurfacePoints:
         return SurfacePoints(self.points[drawn], self.colors[drawn])
 
 
-@dataclass(frozen=True, eq=False)
-class SparseModel:
-    """The cameras and points of structure from motion, of the training views."""
-
-    points: NDArray[np.float64]  # [P, 3] world units
-    seen: Sequence[NDArray[np.int64]]  # rows of the points that each view sees; empty: not known
-
-
-class StereoPoints:
-    """The surfaces that some views show, searched once."""
-
-    def __init__(
-        self, views: Sequence[TrainView], model: Callable[[], SparseModel], progress: Progress
-    ) -> None:
-        self._views, self._model, self._progress = views, model, progress
-        self._found: SurfacePoints | None = None
-
-    def search(self, deadline: Deadline | None = None) -> SurfacePoints:
-        """Returns points on them, away from sparse points; OutOfTime as `find_surfaces`."""
-        if self._found is None:
-            self._found = find_surfaces(self._views, self._model(), self._progress, deadline)
-        return self._found
-
-
-def find_surfaces(
-    views: Sequence[TrainView], model: SparseModel, progress: Progress,
-    deadline: Deadline | None = None,
-) -> SurfacePoints:
+def find_surfaces(evidence: Evidence, deadline: Deadline | None = None) -> SurfacePoints:
     """Returns points on surfaces that two views find, in cells without a sparse point.
 
     Brightness is compared after the gains that the sparse points show, of up to 60 views.
@@ -90,31 +67,32 @@ def find_surfaces(
     Raises:
         OutOfTime: the search would not end in time.
     """
-    deadline = deadline or Deadline()
+    if evidence.tracks is None:
+        return SurfacePoints.nothing()
+    deadline, views, points = deadline or Deadline(), evidence.views, evidence.points
+    tracks = evidence.tracks()
     rows = np.unique(np.linspace(
         0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int))
-    chosen = [reduce_view(view, max(1.0, max(view.camera.width, view.camera.height) / _SIDE))
-              for view in (views[row] for row in rows)]
-    seen = _visibility(chosen, [model.seen[row] for row in rows], model.points)
-    depths = [view.camera.viewmat[2, :3] @ model.points[mine].T + view.camera.viewmat[2, 3]
+    chosen = [reduce_to(views[row], _SIDE) for row in rows]
+    seen = _visibility(chosen, [tracks[row] for row in rows], points)
+    depths = [view.camera.viewmat[2, :3] @ points[mine].T + view.camera.viewmat[2, 3]
               for view, mine in zip(chosen, seen, strict=True)]
     depths = [depth[depth > 0] for depth in depths]
-    told = [len(depth) >= _LEAST_SEEN for depth in depths]
-    if sum(told) < _AGREE:
+    usable = [len(depth) >= _LEAST_SEEN for depth in depths]
+    if sum(usable) < _AGREE:
         return SurfacePoints.nothing()
-    chosen, depths = ([one for one, tells in zip(every, told, strict=True) if tells]
-                      for every in (chosen, depths))
-    seen = seen[told]
-    gains = np.exp(estimate_gains(chosen, model.points).log_gains.mean(axis=1))
+    chosen, depths = (list(compress(every, usable)) for every in (chosen, depths))
+    seen = seen[usable]
+    gains = np.exp(estimate_gains(chosen, points).log_gains.mean(axis=1))
     photos = [
         StereoView(view, float(np.quantile(depth, _TAIL)), float(np.quantile(depth, 1 - _TAIL)),
                    float(gain)) for view, depth, gain in zip(chosen, depths, gains, strict=True)]
     median = float(np.median(np.concatenate(depths)))
-    some = np.random.default_rng(0).permutation(len(model.points))[:_SAMPLES]
+    some = np.random.default_rng(0).permutation(len(points))[:_SAMPLES]
     partners = find_partners(
-        [view.camera for view in chosen], model.points[some], seen[:, some], _NEIGHBOURS)
+        [view.camera for view in chosen], points[some], seen[:, some], _NEIGHBOURS)
     total = 2 * len(photos)
-    with progress.bar("stereo", total, unit="view") as bar:
+    with evidence.progress.bar("stereo", total, unit="view") as bar:
         done, pace = count(1), deadline.keep_pace(total)
 
         def advance() -> None:
@@ -122,7 +100,7 @@ def find_surfaces(
             pace(next(done))
 
         found = find_depths(photos, partners, _NEAR * median, advance)
-    return _merge(chosen, found, model.points, _CELL * median)
+    return _merge(chosen, found, points, _CELL * median)
 
 
 def _visibility(
@@ -147,7 +125,7 @@ def _merge(
     parts = []
     for view, depth in zip(views, depths, strict=True):
         pixels = np.flatnonzero(depth > 0)
-        where = places(view.camera, depth, pixels)
+        where = unproject(view.camera, depth, pixels)
         cells, inverse = np.unique(_cells(where, side), return_inverse=True)
         values = np.column_stack([where, view.image.reshape(-1, 3)[pixels], np.ones(len(pixels))])
         sums = np.stack([np.bincount(inverse, column, len(cells)) for column in values.T], axis=1)
@@ -165,3 +143,31 @@ def _cells(where: NDArray[np.float64], side: float) -> NDArray[np.int64]:
     """Returns the number of the cell of each place [N, 3]."""
     at = np.clip(np.floor(where / side), -_HALF, _HALF - 1).astype(np.int64) + _HALF
     return np.asarray((at[:, 0] * 2 * _HALF + at[:, 1]) * 2 * _HALF + at[:, 2])
+
+
+def surfaces_of(task: Task, evidence: Evidence, deadline: Deadline | None = None) -> SurfacePoints:
+    """Returns the points that a run begins with besides the sparse ones.
+
+    They fill what the sparse points leave of half of the cap: the rest goes where the error is.
+    OutOfTime where a search for them would not end by the deadline.
+    """
+    config = task.schedule.config
+    room = config.max_gaussians // 2 - len(evidence.points)
+    if room <= 0:
+        return SurfacePoints.nothing()
+    return evidence.once(find_surfaces, deadline).at_most(room, config.seed)
+
+
+def _attach(start: Start) -> None:
+    found = surfaces_of(start.task, start.evidence)
+    start.add_points(found.points, found.colors)
+
+
+def _prepare(task: Task, evidence: Evidence, deadline: Deadline) -> None:
+    found = surfaces_of(task, evidence, deadline)
+    logger.info("%s points on surfaces besides %s of sfm", f"{len(found.points):,}",
+                f"{len(evidence.points):,}")
+
+
+# They gain in every room: no trial.
+PART = Part("stereo", lambda _: Sign(on=True), attach=_attach, prepare=_prepare)

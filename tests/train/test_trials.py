@@ -6,7 +6,7 @@ import pytest
 from wall_scene import CONFIG, scene
 
 from recon_cli.deadline import Deadline
-from recon_cli.train.feature_trials import examine
+from recon_cli.train.parts.trials import examine
 
 pytestmark = pytest.mark.integration
 
@@ -17,19 +17,19 @@ def reasons(needs):
 
 def test_a_plain_scene_needs_nothing_and_pays_nothing():
     needs = examine(scene())
-    assert needs.config.far == needs.config.exposure == "off"
+    assert needs.config.background == needs.config.exposure == "off"
     assert needs.config.vignette == "off"
     assert not any(one.seconds for one in needs.decisions)
-    assert needs.moving is None
-    assert "cover all" in reasons(needs)["far"]
+    assert needs.masks is None
+    assert "cover all" in reasons(needs)["background"]
     assert "differs by" in reasons(needs)["exposure"]
 
 
 def test_a_view_through_a_window_is_modelled_far_outside():
     needs = examine(scene(window=True))
-    decision = next(one for one in needs.decisions if one.name == "far")
+    decision = next(one for one in needs.decisions if one.name == "background")
     assert decision.on, decision.reason
-    assert needs.config.far == "on"
+    assert needs.config.background == "on"
     assert decision.mean_db > 0.3
 
 
@@ -48,7 +48,7 @@ def test_a_lens_with_dark_corners_is_found_and_helped():
 
 
 def test_one_exposure_for_all_needs_no_trial_but_a_drift():
-    config = replace(CONFIG, look="even", far="off", moving="off")
+    config = replace(CONFIG, brightness="even", background="off", moving="off")
     even, plain = examine(scene(drift=0.15, config=config)), examine(scene(config=config))
     assert (even.config.exposure, plain.config.exposure) == ("on", "off")
     assert not any(one.seconds for one in even.decisions)
@@ -63,7 +63,8 @@ def test_surfaces_by_stereo_are_used_without_a_trial():
 
 def test_what_the_options_say_is_not_tried():
     config = replace(
-        CONFIG, far="off", stereo="on", exposure="on", depth="off", moving="off", vignette="off")
+        CONFIG, background="off", stereo="on", exposure="on", depth="off", moving="off",
+        vignette="off")
     needs = examine(scene(window=True, config=config))
     assert needs.decisions == ()
     assert needs.config == config
@@ -71,7 +72,7 @@ def test_what_the_options_say_is_not_tried():
 
 def test_too_few_views_switch_nothing_on():
     needs = examine(scene(window=True, drift=0.15, views=6))
-    assert needs.config.exposure == needs.config.far == "off"
+    assert needs.config.exposure == needs.config.background == "off"
     assert "too few views" in reasons(needs)["exposure"]
 
 
@@ -103,11 +104,11 @@ def test_trials_that_would_end_late_are_cut_and_parts_are_as_without_evidence():
     deadline = Deadline(15.0, clock)  # of some 400 steps; a trial takes 800
     needs = examine(replace(scene(window=True, drift=0.15), deadline=deadline, harmonics=True))
     assert [one.name for one in needs.untried] == [
-        "far", "exposure", "harmonics above degree 0", "moving"][:len(needs.untried)]
+        "background", "exposure", "harmonics above degree 0", "moving"][:len(needs.untried)]
     assert len(needs.untried) >= 3
-    assert (needs.config.far, needs.config.exposure) == ("on", "off")
+    assert (needs.config.background, needs.config.exposure) == ("on", "off")
     assert needs.config.sh_degree == CONFIG.sh_degree
-    assert needs.moving is None
+    assert needs.masks is None
     assert clock.now < 15
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from recon_cli.config.stages import TrainConfig
 from recon_cli.errors import ConfigError
-from recon_cli.train.protocol import fit_protocol, image_size
+from recon_cli.stages.train import fit_protocol, image_size
 from recon_cli.workspace.records import Frame, choose_held_out
 
 NAMES = [f"photo_{number:03d}.png" for number in range(20)]

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.evaluation.reference_views import render_view
-from recon_cli.io.images import reduce_view
+from recon_cli.io.images import reduce_to
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import places
+from recon_cli.stereo.depths import unproject
 
 SIDE = 150  # pixels of the longer side of the views that are compared
 _OTHERS = 14  # views that each is compared with, spread over all that show the same
@@ -30,6 +30,28 @@ _GRID = 6  # pixels from one to the next that are looked at to tell that
 _TOLERANCE = 0.06  # of a depth, within which two views see the same surface
 _SMOOTH = 1.0  # pixels, standard deviation: small errors of poses do not count
 _DARK = 0.06  # brightness from which a pixel tells the gain of a view
+# A region begins where the contradiction is beyond all noise and ends where it is no more. Noise is
+# the capture's own: the median over all pixels of all views.
+_STRONG, _WEAK = 8.0, 3.0  # times the noise
+# Of the brightness. A shadow begins faintly: what is fainter than _TELLS only adds to a region.
+_LEAST_STRONG, _TELLS, _LEAST_WEAK = 0.10, 0.04, 0.025
+_BEYOND = 3.0  # times the spread of the others
+_AREA = 0.004  # of a view's pixels; smaller regions are errors of the model
+_THICK = 2.0  # pixels from the middle of a region to its border; edges of things are thin
+_MARGIN = 2  # pixels that a region is widened by
+# Half of a region must be this many times beyond the spread of the others, who must agree. After a
+# short run it was 15 and more for 40 made people and 30 for a monitor that shows something else
+# (desk_monitors), up to 10.8 for gloss, windows, vignettes and poor surfaces in nine captures.
+SURE, _SPREAD_FLOOR = 12.0, 0.001
+# A tenth of it must stand out clearly: shadows of whoever films stay below .21 (fox), people had
+# more than .3. And half of it must be visible to so many others.
+_CLEAR, _WITNESSES = 0.22, 4
+_REACH = 0.12  # of the longer side: a faint part is no farther from a strong one
+_ALONE = 0.8  # of _CLEAR: what a view errs by where it contradicts others
+# Share of the views of a surface that may show something else there. Where more do, as at a window
+# or a mirror, it is the model that is wrong.
+_FEW = 0.5
+_TOO_NOISY = 0.03  # noise of a model that is too poor to tell: two walks of three such had errors
 
 Error = NDArray[np.float32]
 
@@ -48,7 +70,7 @@ def compare_view(
     splats: Splats, view: TrainView, sh_degree: int, backend: str, *, side: int = SIDE
 ) -> ComparedView:
     """Returns a view, reduced to `side` pixels, beside its render."""
-    small = reduce_view(view, max(1.0, max(view.camera.width, view.camera.height) / side))
+    small = reduce_to(view, side)
     rgb = render_view(splats, small.camera, sh_degree, backend).rgb.cpu().numpy()
     depth = render_surface(splats, small.camera, backend=backend).depth.cpu().numpy()
     photo = (small.image / 255).astype(np.float32)
@@ -72,14 +94,14 @@ def _smooth(error: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(error, (0, 0), _SMOOTH), np.float32)
 
 
-def find_others(
+def find_overlapping(
     own: ComparedView, views: Sequence[ComparedView], most: int = _OTHERS
 ) -> NDArray[np.int64]:
     """Returns which of `views` see the surface of another view, spread evenly over the capture."""
     pixels = _grid(own.depth)
     if not len(pixels):
         return np.empty(0, np.int64)
-    where = places(own.camera, own.depth, pixels)
+    where = unproject(own.camera, own.depth, pixels)
     shares = np.array([0.0 if other is own else float(np.mean(sees(other, where)))
                        for other in views])
     good = np.flatnonzero(shares >= _SHARED)
@@ -124,23 +146,23 @@ class Contradiction:
     # [H, W] error beyond the others' median error, 0 to 1; where too few see the surface, all of it
     amount: NDArray[np.float32]
     spread: NDArray[np.float32]  # [H, W] how far the others differ from their median
-    seen: NDArray[np.int64]  # [H, W] others that see the surface
+    visible: NDArray[np.int64]  # [H, W] others that see the surface
 
 
 def contradict(
     views: Sequence[ComparedView], own: ComparedView, others: NDArray[np.int64],
-    suspects: NDArray[np.bool_],
+    candidates: NDArray[np.bool_],
 ) -> Contradiction:
     """Returns how `own` contradicts those of `views` that `others` names, in some pixels [H, W]."""
     height, width = own.depth.shape
-    pixels = np.flatnonzero((own.depth.reshape(-1) > 0) & suspects.reshape(-1))
-    amount = (_length(own.error) * suspects).reshape(-1)
+    pixels = np.flatnonzero((own.depth.reshape(-1) > 0) & candidates.reshape(-1))
+    amount = (_length(own.error) * candidates).reshape(-1)
     spread = np.zeros(height * width, np.float32)
-    seen = np.zeros(height * width, np.int64)
+    witnesses = np.zeros(height * width, np.int64)
     if not len(pixels) or not len(others):
         return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
-                             seen.reshape(height, width))
-    where = places(own.camera, own.depth, pixels)
+                             witnesses.reshape(height, width))
+    where = unproject(own.camera, own.depth, pixels)
     errors = np.full((len(others), len(pixels), 3), np.inf, np.float32)
     for row, index in zip(errors, others, strict=True):
         other = views[index]
@@ -148,16 +170,16 @@ def contradict(
         column, line, _ = _project(other.camera, where[visible])
         row[visible] = _sample(other.error, column, line)
     count = np.isfinite(errors[..., 0]).sum(axis=0)
-    told = count >= _LEAST
-    errors, rows = errors[:, told], (count[told] - 1) // 2
+    has_evidence = count >= _LEAST
+    errors, rows = errors[:, has_evidence], (count[has_evidence] - 1) // 2
     middle = _median(errors, rows)
-    mine = own.error.reshape(-1, 3)[pixels[told]]
-    amount[pixels[told]] = np.sqrt(np.square(mine - middle).mean(axis=1))
-    spread[pixels[told]] = _median(np.abs(errors - middle).mean(axis=2), rows)
-    seen[pixels] = count
+    mine = own.error.reshape(-1, 3)[pixels[has_evidence]]
+    amount[pixels[has_evidence]] = np.sqrt(np.square(mine - middle).mean(axis=1))
+    spread[pixels[has_evidence]] = _median(np.abs(errors - middle).mean(axis=2), rows)
+    witnesses[pixels] = count
     amount[~own.counts.reshape(-1)] = 0
     return Contradiction(amount.reshape(height, width), spread.reshape(height, width),
-                         seen.reshape(height, width))
+                         witnesses.reshape(height, width))
 
 
 def _median(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -181,30 +203,6 @@ def _sample(
     return np.asarray(values.reshape(-1, 3)[:len(column)], np.float32)
 
 
-# A region begins where the contradiction is beyond all noise and ends where it is no more. Noise is
-# the capture's own: the median over all pixels of all views.
-_STRONG, _WEAK = 8.0, 3.0  # times the noise
-# Of the brightness. A shadow begins faintly: what is fainter than _TELLS only adds to a region.
-_LEAST_STRONG, _TELLS, _LEAST_WEAK = 0.10, 0.04, 0.025
-_BEYOND = 3.0  # times the spread of the others
-_AREA = 0.004  # of a view's pixels; smaller regions are errors of the model
-_THICK = 2.0  # pixels from the middle of a region to its border; edges of things are thin
-_MARGIN = 2  # pixels that a region is widened by
-# Half of a region must be this many times beyond the spread of the others, who must agree. After a
-# short run it was 15 and more for 40 made people and 30 for a monitor that shows something else
-# (desk_monitors), up to 10.8 for gloss, windows, vignettes and poor surfaces in nine captures.
-SURE, _SPREAD_FLOOR = 12.0, 0.001
-# A tenth of it must stand out clearly: shadows of whoever films stay below .21 (fox), people had
-# more than .3. And half of it must be seen by so many others.
-_CLEAR, _WITNESSES = 0.22, 4
-_REACH = 0.12  # of the longer side: a faint part is no farther from a strong one
-_ALONE = 0.8  # of _CLEAR: what a view errs by where it contradicts others
-# Share of the views of a surface that may show something else there. Where more do, as at a window
-# or a mirror, it is the model that is wrong.
-_FEW = 0.5
-_TOO_NOISY = 0.03  # noise of a model that is too poor to tell: two walks of three such had errors
-
-
 def noise_level(views: Sequence[ComparedView]) -> float:
     """Returns the error that half of the pixels of a capture stay below, 0 to 1."""
     values = np.concatenate([_length(view.error)[view.counts] for view in views])
@@ -215,7 +213,7 @@ def _length(error: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.square(error).mean(axis=-1)), np.float32)
 
 
-def find_suspects(view: ComparedView, noise: float) -> NDArray[np.bool_]:
+def find_candidates(view: ComparedView, noise: float) -> NDArray[np.bool_]:
     """Returns where a view differs enough from its render to be compared with others, [H, W].
 
     What moves errs by itself about as much as it contradicts others, so that most regions of most
@@ -255,21 +253,22 @@ def _is_large(region: NDArray[np.bool_], strong: NDArray[np.bool_]) -> bool:
 
 
 def find_regions(
-    found: Contradiction, noise: float, agreed: float = SURE
+    contradiction: Contradiction, noise: float, agreed: float = SURE
 ) -> NDArray[np.bool_]:
     """Returns where a view shows what moves, [H, W]: connected, large and contradicted."""
-    strong, weak = _thresholds(found.amount - _BEYOND * found.spread, noise)
-    ratio = found.amount / (found.spread + _SPREAD_FLOOR)
+    strong, weak = _thresholds(contradiction.amount - _BEYOND * contradiction.spread, noise)
+    ratio = contradiction.amount / (contradiction.spread + _SPREAD_FLOOR)
     result = np.zeros(weak.shape, np.bool_)
     for region in _components(weak):
         # what others do not see belongs to a region that they contradict, and makes none
-        told = region & (found.seen >= _LEAST) & (found.amount >= _TELLS)
-        if (_is_large(told, strong)
-                and np.median(ratio[told]) >= agreed
-                and np.quantile(found.amount[told], 0.9) >= _CLEAR
-                and np.median(found.seen[told]) >= _WITNESSES):
+        has_evidence = region & (contradiction.visible >= _LEAST) & (contradiction.amount >= _TELLS)
+        if (_is_large(has_evidence, strong)
+                and np.median(ratio[has_evidence]) >= agreed
+                and np.quantile(contradiction.amount[has_evidence], 0.9) >= _CLEAR
+                and np.median(contradiction.visible[has_evidence]) >= _WITNESSES):
             reach = round(_REACH * max(region.shape))
-            result |= region & (cv2.dilate((told & strong).astype(np.uint8), _disc(reach)) > 0)
+            near = cv2.dilate((has_evidence & strong).astype(np.uint8), _disc(reach)) > 0
+            result |= region & near
     return np.asarray(cv2.dilate(result.astype(np.uint8), _disc(_MARGIN)) > 0)
 
 
@@ -296,7 +295,7 @@ def _common(
 ) -> float:
     """Returns in what share of the other views of its surface a part of a view is in a region."""
     pixels = np.flatnonzero(part.reshape(-1) & (own.depth.reshape(-1) > 0))
-    where = places(own.camera, own.depth, pixels)
+    where = unproject(own.camera, own.depth, pixels)
     seen = inside = 0
     for index in others:
         other = views[index]
@@ -330,10 +329,10 @@ def find_moving(
     noise = noise_level(others)
     if noise > _TOO_NOISY:
         return regions
-    suspects = {row: where for row, view in enumerate(views)
-                if (where := find_suspects(view, noise)).any()}
-    partners = {row: find_others(views[row], others) for row in suspects}
-    for row, where in suspects.items():
+    candidates = {row: where for row, view in enumerate(views)
+                if (where := find_candidates(view, noise)).any()}
+    partners = {row: find_overlapping(views[row], others) for row in candidates}
+    for row, where in candidates.items():
         found = contradict(others, views[row], partners[row], where)
         regions[row] = find_regions(found, noise, agreed)
     if witnesses is not None:

@@ -1,20 +1,21 @@
 """Decisions by paired trials: when they are made, on which views, and by which score."""
 
 import math
+import time
 
 import numpy as np
 import pytest
 
 from recon_cli.evaluation.metrics import corrected_psnr
-from recon_cli.train.trial_decisions import LEAST_VIEWS, decide, skip_trial, split
+from recon_cli.train.parts.decisions import LEAST_VIEWS, Rule, decide, skip_trial, split
 
 BASE = [20.0, 31.0, 25.0, 28.0, 22.0, 33.0, 27.0, 24.0]
 
 
-def decided(gains, **options):
+def decided(gains, clock=time.perf_counter, **rule):
     arms = (lambda: BASE[: len(gains)],
             lambda: [base + gain for base, gain in zip(BASE, gains, strict=False)])
-    return decide("part", arms, **options)
+    return decide("part", arms, Rule(**rule), clock=clock)
 
 
 def test_the_mean_and_its_error_are_those_of_paired_differences():

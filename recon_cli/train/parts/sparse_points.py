@@ -1,4 +1,4 @@
-"""Estimates exposure from the colours of sparse points, before any training.
+"""Sparse points in the views: where they fall, their colours, and the gains that these show.
 
 A point shows the same surface to all views: the ratio of its colours in two views is that of their
 gains. Occlusion makes some ratios wrong, which the median over all shared points ignores.
@@ -10,54 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.background import project_points
-from recon_cli.train.optimizer import SparseAdam
-
-# Falling to a tenth as in INRIA 3DGS, but lower: on two phone videos, held-out views gained .72 and
-# .25 dB with .003, but .17 and -.01 dB with .01 (after the best gain of each view).
-_RATE, _FINAL_RATE = 0.003, 0.0003
-_PREFIX = "exposure"
-
-
-class Exposure:
-    """The log-gains of all training images and their optimizer; `start` [F, 3] gets a mean of 0."""
-
-    def __init__(self, images: int, *, start: NDArray[np.float64] | None = None) -> None:
-        first = np.zeros((images, 3)) if start is None else start
-        if first.shape != (images, 3):
-            raise ValueError(f"log-gains of shape {first.shape}, needed {(images, 3)}")
-        self._rows = SparseAdam(torch.from_numpy(first - first.mean(axis=0)))
-
-    @property
-    def log_gains(self) -> NDArray[np.float64]:
-        """Natural logarithm of the gains of all images, [F, 3] RGB; a copy."""
-        return self._rows.value.numpy().copy()
-
-    def gain(self, image: int) -> NDArray[np.float32]:
-        """Returns the factors of the rendered channels of an image, [3]."""
-        return np.asarray(np.exp(self._rows.value[image].numpy()), np.float32)
-
-    def step(self, image: int, gradient: NDArray[np.float64], done: float) -> None:
-        """Moves one image's gains against `gradient` [3] of their logarithms.
-
-        The rate falls as `done` goes from 0 to 1.
-        """
-        self._rows.step(image, gradient, _RATE * (_FINAL_RATE / _RATE) ** done)
-        self._rows.center()
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Returns gains, moments and counts by name, for a checkpoint."""
-        return self._rows.tensors(_PREFIX)
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Restores the state that `tensors` returned."""
-        self._rows.restore(_PREFIX, tensors)
-
 
 _SIDE = 100  # pixels of the longer side; a small view is denoised and does not mind blur
 _POINTS = 4000  # enough for medians of hundreds of points in two views that share a tenth
@@ -74,7 +30,7 @@ _OWN = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class GainEstimate:
     """Log-gains of views as their sparse points show them."""
 
     # [F, 3] RGB, natural logarithm, of mean 0; zeros for a view without evidence
@@ -101,7 +57,7 @@ def estimate_gains(
     points: NDArray[np.float64],  # [P, 3]
     *,
     seed: int = 0,
-) -> Estimate:
+) -> GainEstimate:
     """Returns the log-gain of each view from the colours that points have in several views.
 
     Weighted least squares over pairs: the median log-ratio of the points that two views share
@@ -112,12 +68,24 @@ def estimate_gains(
     pairs, medians, weights = _pairs(logs)
     known = np.unique(pairs)
     if len(known) == 0:
-        return Estimate(np.zeros((len(views), 3)), 0.0, 0.0, 0)
+        return GainEstimate(np.zeros((len(views), 3)), 0.0, 0.0, 0)
     gains = _solve(pairs, medians, weights, len(views))
     variance = gains[known].var(axis=0).sum()
     apart = ((gains[known] - gains[_nearest(logs)[known]]) ** 2).mean(axis=0).sum()
-    return Estimate(gains, float(gains[known].std(axis=0).max()),
-                    float(apart / max(2 * variance, 1e-12)), len(pairs))
+    return GainEstimate(gains, float(gains[known].std(axis=0).max()),
+                        float(apart / max(2 * variance, 1e-12)), len(pairs))
+
+
+def project_points(
+    camera: Camera, points: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Returns the rows of the points inside the image, and the columns and lines they fall on."""
+    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
+    ahead = np.maximum(z, 1e-9)
+    u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
+    rows = np.flatnonzero(
+        (z > 1e-9) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height))
+    return rows, u[rows].astype(np.int64), v[rows].astype(np.int64)
 
 
 def choose_points(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:

@@ -21,9 +21,25 @@ _SPLIT = 6  # each sixth training view is held out by an own split, or sooner ea
 _DENSEST = 3  # of few views; the rest must still hang together
 
 Arm = Callable[[], Sequence[float]]
-
-
 NO_TIME = "there was no time to try it"  # the reason of what is decided without
+
+
+@dataclass(frozen=True)
+class Rule:
+    """When the gain of a part counts."""
+
+    threshold_db: float = THRESHOLD_DB
+    errors: float = _ERRORS  # standard errors that it must exceed as well
+    # on as long as the mean is not below zero by the threshold and one standard error, and where
+    # there is no time to try it
+    unless_worse: bool = False
+    as_filmed: bool = False  # brightness as filmed counts as much as after the best gains
+
+    def needed_db(self, error: float) -> float:
+        """Returns the mean gain that is needed at its standard error, both in dB."""
+        if self.unless_worse:
+            return -max(self.threshold_db, _ERRORS_AGAINST * error)
+        return max(self.threshold_db, self.errors * error)
 
 
 def skip_trial(name: str, reason: str, *, on: bool = False) -> TrialDecision:
@@ -33,16 +49,13 @@ def skip_trial(name: str, reason: str, *, on: bool = False) -> TrialDecision:
 
 
 def decide(
-    name: str, arms: tuple[Arm, Arm], *, threshold_db: float = THRESHOLD_DB,
-    errors: float = _ERRORS, unless_worse: bool = False,
+    name: str, arms: tuple[Arm, Arm], rule: Rule | None = None, *,
     clock: Callable[[], float] = time.perf_counter,
 ) -> TrialDecision:
-    """Returns whether the second arm is better than the first.
+    """Returns whether the second arm is better than the first by the rule.
 
-    On, if the mean gain is above the threshold and above `errors` standard errors of the paired
-    differences; with `unless_worse` also if it is not below zero by the threshold and one standard
-    error. Each arm, without and with the part, trains and returns the scores of the same views in
-    dB.
+    Each arm, without and with the part, trains and returns the scores of the same views in dB,
+    whose paired differences count.
 
     Raises:
         ValueError: the arms score different numbers of views, or fewer than two.
@@ -54,8 +67,7 @@ def decide(
     gains = with_it - without
     mean = float(gains.mean())
     error = float(gains.std(ddof=1)) / math.sqrt(len(gains))
-    needed = (-max(threshold_db, _ERRORS_AGAINST * error) if unless_worse
-              else max(threshold_db, errors * error))
+    needed = (rule or Rule()).needed_db(error)
     on = mean > needed  # False for what is not a number
     reason = (f"{mean:+.2f} dB +- {error:.2f} over {len(gains)} views, "
               f"{'more' if on else 'not more'} than the {needed:.2f} dB that count")

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from recon_cli.context import EarlierResult
 from recon_cli.errors import FormatError, InputError, ManifestError
-from recon_cli.io.images import decode_file, read_mask, write_png
+from recon_cli.io.images import decode_file, fill_masked, read_mask, write_png
 from recon_cli.scene.scene import Scene, View
-from recon_cli.train.moving_search import Regions, enlarge
+from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.layout import link_or_copy, remove
 from recon_cli.workspace.summaries import MovingSummary
@@ -32,6 +32,7 @@ _HALF = 128  # in a mask of a user, as in those of photos: from this value on a 
 
 logger = logging.getLogger("recon")
 Counts = NDArray[np.bool_]
+Regions = list[NDArray[np.bool_]]  # [h, w] what is to be masked in each view, at any size
 
 
 @dataclass(frozen=True)
@@ -198,3 +199,24 @@ def with_masks(scene: Scene, folder: Path) -> Scene:
         return scene
     return dataclasses.replace(
         scene, train=masked(scene.train), validation=masked(scene.validation))
+
+
+def hide(views: Sequence[TrainView], regions: Sequence[NDArray[np.bool_]]) -> list[TrainView]:
+    """Returns the views without their regions [h, w], which may be of another size."""
+    hidden = []
+    for view, region in zip(views, regions, strict=True):
+        if region.any():
+            counts = ~enlarge(region, view.camera.width, view.camera.height)
+            if view.mask is not None:
+                counts &= view.mask
+            image = fill_masked(view.image, counts)
+            hidden.append(dataclasses.replace(view, stored=image, mask=counts, file=None))
+        else:
+            hidden.append(view)
+    return hidden
+
+
+def enlarge(region: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+    """Returns a region in another size, with a smooth border."""
+    large = cv2.resize(region.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large > 0.5)

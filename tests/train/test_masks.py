@@ -11,7 +11,7 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.io.images import read_mask, write_png
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
-from recon_cli.train.moving_masks import (
+from recon_cli.train.masks import (
     EditedMasks,
     copy_masks,
     join_masks,
