@@ -114,7 +114,7 @@ class SfmConfig(StageConfig):
         True, "Cut a broken model, and keep the parts that can be trusted on their own.",
         hashed=False)
     part: int = option(
-        1, "Part to use of a capture that has several; 1 is the largest. Another one needs no new "
+        1, "Part to use of a capture that has several; 1 shows most. Another one needs no new "
         "mapping.", metavar="K", minimum=1)
     seed: int = option(0, "Random seed of the mapper.", minimum=0)
     gravity: str = option(

@@ -83,7 +83,7 @@ class MappingJob(JsonRecord):
     # names of the frames of each segment that was mapped apart, in folders of `segments`
     segments: tuple[tuple[str, ...], ...] = ()
     split: int = 0  # segments to cut the view graph into; none where 0
-    part: int = 1  # of the capture, which is placed; 1 is the largest
+    part: int = 1  # of the capture, which is placed; 1 shows most
     last: str = STEPS[-1]  # the last step to take
     # after which a model that can be trusted is not sought to be improved; None: --max-minutes
     spare_minutes: float | None = None
@@ -128,7 +128,7 @@ class MappingJob(JsonRecord):
 
     @property
     def model(self) -> Path:
-        """The model of the largest part."""
+        """The model of the part that shows most."""
         return self.parts / "1"
 
     @property

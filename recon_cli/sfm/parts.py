@@ -1,4 +1,4 @@
-"""The parts of a capture in the stage's folder: parts/1 is the largest, and parts/2 the next one.
+"""The parts of a capture in the stage's folder: parts/1 shows most, and parts/2 comes next.
 
 Each is a COLMAP model in the mapper's own frame. One of them is placed and undistorted; another
 one is taken without mapping again, also from a finished result.
@@ -34,7 +34,7 @@ from recon_cli.workspace.summaries import SfmSummary
 def write_parts(
     job: MappingJob, parts: Sequence[tuple[pycolmap.Reconstruction, ModelVerdict | None]]
 ) -> None:
-    """Writes all parts, the largest first, with the verdict on each, whole or not at all."""
+    """Writes all parts with the verdict on each, whole or not at all; the first shows most."""
     folder = fresh_folder(job.out / "parts.partial")
     for number, (model, verdict) in enumerate(parts, 1):
         own = fresh_folder(folder / str(number))

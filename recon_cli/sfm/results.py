@@ -78,7 +78,7 @@ class EarlierRun(JsonRecord):
 class ModelResult(StepResult):
     """The parts of the capture, and how they were found; see `SfmSummary`."""
 
-    parts: tuple[PartResult, ...]  # the largest first
+    parts: tuple[PartResult, ...]  # that which shows most first
     models: tuple[int, ...]
     poses: PosesSummary | None = field(default_factory=lambda: None)
     apart: tuple[Names, ...] = ()

@@ -9,6 +9,7 @@ is known of how one part lies to another, nor of the ratio of their scales.
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -17,7 +18,7 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import checks, mapper
 from recon_cli.sfm.job import MappingJob
-from recon_cli.sfm.limits import MIN_FRAMES, MIN_IMAGES_PRINCIPAL
+from recon_cli.sfm.limits import MIN_FRAMES, MIN_IMAGES_PRINCIPAL, MIN_PARALLAX_DEG
 from recon_cli.sfm.merge_models import ModelCandidate, drop_outliers
 from recon_cli.sfm.verdict import (
     MAX_LEAP,
@@ -42,7 +43,7 @@ JOIN_PANORAMAS = (
 def deliver_parts(
     job: MappingJob, model: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
 ) -> list[ModelCandidate]:
-    """Returns the parts of a capture that can be trusted, the largest first.
+    """Returns the parts of a capture that can be trusted, that which shows most first.
 
     `others` are models beside the largest one, `model`. --accept-weak and --no-partial keep that as
     it is.
@@ -90,8 +91,9 @@ def frames_asked(job: MappingJob, verdict: ModelVerdict) -> Names:
 def find_parts(
     job: MappingJob, model: ModelCandidate, others: Iterable[pycolmap.Reconstruction] = ()
 ) -> list[ModelCandidate]:
-    """Returns the largest part that can be trusted, of three cameras or more, and others.
+    """Returns the parts that can be trusted, that which shows most first.
 
+    Where none has the frames that a part must have, that is the largest, of three cameras or more.
     The points of a model that has none are triangulated.
     """
     least = least_frames(job)
@@ -104,8 +106,22 @@ def find_parts(
             part = drop_outliers(job, mapper.sharpen(_cut_out(full, names)))
             parts += _cut(job, part, least)
     parts.sort(key=lambda part: mapper.model_size(part.model), reverse=True)
-    return [part for index, part in enumerate(parts)
-            if not index or part.model.num_reg_images() >= least]
+    worth = [part for part in parts if part.model.num_reg_images() >= least] or parts[:1]
+    return sorted(worth, key=lambda part: count_distinct_views(part.model), reverse=True)
+
+
+def count_distinct_views(model: pycolmap.Reconstruction) -> float:
+    """Returns how many images without overlap would show the surfaces that a model shows.
+
+    That needs no scale, which parts do not share, nor does it count what a camera sees again while
+    it waits: a point counts as the share of the points of an image that it is, on the mean of the
+    images that see it. Points without parallax do not count.
+    """
+    surface = mapper.triangulation_angles(model) >= MIN_PARALLAX_DEG
+    tracks = [[element.image_id for element in point.track.elements]
+              for point, shown in zip(model.points3D.values(), surface, strict=True) if shown]
+    counts = Counter(image for track in tracks for image in track)
+    return sum(sum(1 / counts[image] for image in track) / len(track) for track in tracks)
 
 
 def _cut(job: MappingJob, model: ModelCandidate, least: int) -> Iterator[ModelCandidate]:

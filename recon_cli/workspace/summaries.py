@@ -157,7 +157,7 @@ class SfmSummary(JsonRecord):
     world: WorldSummary
     cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
     left_out: tuple[str, ...] = ()  # names of the frames whose camera is in no part
-    parts: tuple[PartSummary, ...] = ()  # the largest first; none in results of older versions
+    parts: tuple[PartSummary, ...] = ()  # that which shows most first; none in older results
     part: int | None = None  # the number of the one that is placed; None where there is only one
     broken: tuple[str, ...] = ()  # why the model was cut, sentences; none where it was not
     segments: int = 1  # that were mapped apart and joined; 1 for a capture mapped as a whole

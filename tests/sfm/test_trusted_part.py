@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from made_model import broken_walk, doubled_place, moved, walk
+from made_model import MadeModel, along, broken_walk, doubled_place, moved, walk, wall
 
 from recon_cli.errors import SfmError
 from recon_cli.sfm import trusted_part
 from recon_cli.sfm.job import CameraGroup, MappingJob
 from recon_cli.sfm.mapper import list_registered
 from recon_cli.sfm.merge_models import ModelCandidate, build_posed_model
-from recon_cli.sfm.trusted_part import deliver_parts, find_parts
+from recon_cli.sfm.trusted_part import count_distinct_views, deliver_parts, find_parts
 from recon_cli.sfm.verdict import examine
 
 
@@ -23,9 +23,11 @@ def prepare(made, folder, **changes):
         frames=folder, denoised=folder, out=folder, groups=(CameraGroup(made.names, 600, 400),),
         masks=None, poses=None, pose_use="keep", given_points=False, pairs="auto",
         max_features=2000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
-        scale_between=None, max_minutes=5.0, seed=0, threads=1, sharpness={}, times={})
+        scale_between=None, max_minutes=5.0, seed=0, threads=1, sharpness={},
+        times={name: float(index) for index, name in enumerate(made.names)})
     job, model = replace(job, **changes), made.model()
-    return job, ModelCandidate(model, examine(model, job.database, job.names), (), {})
+    return job, ModelCandidate(
+        model, examine(model, job.database, job.names, times=job.times), (), {})
 
 
 def cut(model, names):
@@ -63,6 +65,19 @@ def test_of_a_broken_walk_both_sides_are_delivered_the_longer_first(tmp_path):
              for name in made.names[inside]],
             [pose.inverse().translation for pose in made.poses[inside]]))
         np.testing.assert_allclose(steps / steps.mean(), truth / truth.mean(), rtol=1e-3)
+
+
+@pytest.mark.usefixtures("small")
+def test_the_part_that_shows_most_comes_before_one_of_more_frames(tmp_path):
+    waiting, walking = np.arange(10) * 0.06, 30 + np.arange(7) * 1.6
+    made = MadeModel(np.concatenate([wall(-4, 5, count=900), wall(26, 44, count=1800)]),
+                     along([*waiting, *walking]))
+    job, whole = prepare(made, tmp_path)
+    there, onward = cut(whole.model, made.names[:10]), cut(whole.model, made.names[10:])
+    assert count_distinct_views(there) < 1.5 < count_distinct_views(onward)
+    whole = replace(whole, model=there, verdict=examine(
+        there, job.database, job.names, times=job.times))
+    assert held(deliver_parts(job, whole, [onward])) == [made.names[10:], made.names[:10]]
 
 
 def test_a_part_of_few_frames_is_delivered_only_as_the_largest(tmp_path):
