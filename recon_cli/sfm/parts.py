@@ -34,7 +34,7 @@ from recon_cli.workspace.summaries import SfmSummary
 def write_parts(
     job: MappingJob, parts: Sequence[tuple[pycolmap.Reconstruction, ModelVerdict | None]]
 ) -> None:
-    """Writes all parts, that which shows most first, with the verdict on each."""
+    """Writes all parts with the verdict on each, whole or not at all; the first shows most."""
     folder = fresh_folder(job.out / "parts.partial")
     for number, (model, verdict) in enumerate(parts, 1):
         own = fresh_folder(folder / str(number))

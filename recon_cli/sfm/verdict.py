@@ -111,16 +111,12 @@ class ModelVerdict(JsonRecord):
     lenses: tuple[BetterLens, ...] = ()  # cameras that another camera model fits better
     # Of photos: how far the centre of each camera is likely off, as a share of the extent of all.
     camera_errors: camera_covariance.Errors = field(default_factory=dict)
+    rough: Names = ()  # those of them that are known badly, though nothing speaks against them
 
     @property
     def trusted(self) -> bool:
         """Whether nothing speaks against the model."""
         return not self.problems
-
-    @property
-    def rough(self) -> Names:
-        """The cameras that are known badly, though nothing speaks against them."""
-        return camera_covariance.list_rough(self.camera_errors)
 
     def lines(self) -> list[str]:
         """Returns a short text for the terminal."""
@@ -128,7 +124,7 @@ class ModelVerdict(JsonRecord):
         lines = [f"{self.registered} of {format_count(self.images, 'image')} "
                  f"{'has' if self.registered == 1 else 'have'} a camera; the model is {head}."]
         lines += self.problems or self._reassurances()
-        lines += camera_covariance.describe_rough(self.camera_errors)
+        lines += camera_covariance.describe_rough(self.camera_errors, self.rough)
         lines += [
             f"Step {jump.ratio:.0f} times as long as usual: {jump.before} to {jump.after}."
             for jump in self.jumps]
@@ -159,8 +155,8 @@ class ModelVerdict(JsonRecord):
                    "their extent (RMS).")
 
     def to_json(self) -> dict[str, Any]:
-        """Returns JSON values: the fields, whether the model is trusted, and rough cameras."""
-        return {**super().to_json(), "trusted": self.trusted, "rough": list(self.rough)}
+        """Returns JSON values: the fields, and whether the model is trusted."""
+        return {**super().to_json(), "trusted": self.trusted}
 
 
 def examine(
@@ -187,8 +183,10 @@ def examine(
     jumps = find_jumps(evidence, times or {})
     still = find_still_share(model)
     better = find_better_lenses(model, lenses)
+    points = {name: int(count)
+              for name, count in zip(names, evidence.points, strict=True) if count}
     errors = {} if given or times else camera_covariance.estimate_camera_errors(
-        model, [name for name, count in zip(names, evidence.points, strict=True) if count])
+        model, tuple(points))
     return ModelVerdict(
         images=len(names), registered=int(np.count_nonzero(rows)),
         model_parts=model_parts, match_parts=match_parts,
@@ -198,7 +196,8 @@ def examine(
         points=Histogram.from_values(evidence.points[rows]),
         neighbours=Histogram.from_values(
             np.count_nonzero(evidence.shared[rows] >= MIN_POSE_INLIERS, axis=1)),
-        still=still, scale=scale, open_loops=loops, lenses=better, camera_errors=errors,
+        still=still, scale=scale, open_loops=loops, lenses=better,
+        camera_errors=errors, rough=camera_covariance.list_rough(errors, points),
         problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
                   *_describe_drift(loops, scale), *_describe_still(still),
                   *camera_covariance.describe_inexact(errors),

@@ -38,9 +38,10 @@ from recon_cli.io.colmap_library import write_model
 from recon_cli.io.tracks import TRACKS
 from recon_cli.progress import NullProgress
 from recon_cli.sfm import fallbacks, trusted_part, worker, xfeat_weights
+from recon_cli.sfm.camera_covariance import measure_rms
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import ModelCandidate
-from recon_cli.sfm.verdict import examine
+from recon_cli.sfm.verdict import ModelVerdict, examine
 from recon_cli.stages import ingest
 from recon_cli.stages.sfm import _times
 from recon_cli.workspace import records
@@ -120,6 +121,7 @@ class Errors:
     names: tuple[str, ...]
     off: NDArray[np.float64]  # [F], units of the reference
     extent: float  # diagonal of the box around the true centres
+    verdict: ModelVerdict
 
     @property
     def rms(self) -> float:
@@ -130,6 +132,12 @@ class Errors:
     def worst(self) -> float:
         """Percent of the extent."""
         return 100 * float(self.off.max()) / self.extent
+
+    @property
+    def ratios(self) -> NDArray[np.float64]:
+        """How many times as far off the cameras are as the verdict thinks, [F]."""
+        thought = np.array([self.verdict.camera_errors.get(name, np.nan) for name in self.names])
+        return self.off / self.extent / thought
 
 
 @dataclass(frozen=True)
@@ -154,23 +162,33 @@ class Row:
         """Of the part that is off most, percent of its extent."""
         return max((part.rms for part in self.parts), default=float("nan"))
 
+    @property
+    def rough(self) -> int:
+        """Cameras that are said to be rough."""
+        return sum(len(part.verdict.rough) for part in self.parts)
+
     def cells(self, metric: bool) -> list[str]:
         """The cells of its row."""
         centres = " + ".join(
             f"{len(part.names)}: {part.rms:.2f} / {part.worst:.2f}" + (
                 f" ({100 * np.sqrt((part.off**2).mean()):.2f} / {100 * part.off.max():.2f} cm)"
                 if metric else "") for part in self.parts)
+        thought = " + ".join(f"{100 * measure_rms(part.verdict.camera_errors):.2f}"
+                             for part in self.parts)
         return [self.capture, str(self.gap), str(self.offset),
                 f"{sum(len(part.names) for part in self.parts)} of {self.given}", centres or "-",
-                "refused" if self.refused else "trusted", f"{self.seconds:.0f}",
+                thought or "-", "refused" if self.refused else "trusted", str(self.rough),
+                f"{self.seconds:.0f}",
                 self.refused[:90]]
 
 
-HEADS = ("capture", "every", "from", "placed", "RMS / worst %", "verdict", "CPU s", "why")
+HEADS = ("capture", "every", "from", "placed", "RMS / worst %", "thought %", "verdict", "rough",
+         "CPU s", "why")
 
 
-def measure(model: pycolmap.Reconstruction, sources: dict[str, str], truth: Poses) -> Errors:
+def measure(candidate: ModelCandidate, sources: dict[str, str], truth: Poses) -> Errors:
     """Returns the errors of a model's cameras after the similarity that fits best."""
+    model = candidate.model
     found = {image.name: image.projection_center()
              for image in map(model.image, model.reg_image_ids())
              if Path(sources[image.name]).stem in truth}
@@ -179,7 +197,7 @@ def measure(model: pycolmap.Reconstruction, sources: dict[str, str], truth: Pose
     ours = np.array([found[name] for name in names])
     scale, motion = similarity(ours, true)
     off = np.linalg.norm(scale * ours @ motion[:3, :3].T + motion[:3, 3] - true, axis=1)
-    return Errors(names, off, float(np.linalg.norm(np.ptp(true, axis=0))))
+    return Errors(names, off, float(np.linalg.norm(np.ptp(true, axis=0))), candidate.verdict)
 
 
 def prepare(photos: Sequence[Path], folder: Path) -> MappingJob:
@@ -233,9 +251,7 @@ def map_photos(job: MappingJob, folder: Path, *, bridges: bool) -> None:
     shutil.rmtree(job.out)
 
 
-def decide(
-    job: MappingJob, kept: Path
-) -> tuple[list[pycolmap.Reconstruction], str]:
+def decide(job: MappingJob, kept: Path) -> tuple[list[ModelCandidate], str]:
     """Returns the parts that sfm delivers of a kept model, or that and why it is refused."""
     job = dataclasses.replace(job, matches_db=kept / MATCHES)
     model = pycolmap.Reconstruction(kept / "model")
@@ -246,10 +262,9 @@ def decide(
     apart = tuple(tuple(sorted(names - held[0])) for names in held[1:])
     candidate = ModelCandidate(model, verdict, apart, read_json(kept / "rejected.json"))
     try:
-        delivered = trusted_part.deliver_parts(job, candidate, others)
+        return trusted_part.deliver_parts(job, candidate, others), ""
     except ReconError as error:
-        return [model], error.message
-    return [part.model for part in delivered], ""
+        return [candidate], error.message
 
 
 def run(
@@ -277,9 +292,15 @@ def count(rows: Sequence[Row]) -> str:
     wrong = [row for row in rows if row.judged and row.rms > WRONG]
     right = [row for row in rows if row.judged and row.rms < RIGHT]
     trusted = [row for row in wrong if not row.refused]
+    silent = [row for row in trusted if not row.rough]
     refused = [row for row in right if row.refused]
-    return (f"over {WRONG:g}% of the extent and trusted: {len(trusted)} of {len(wrong)}; "
-            f"under {RIGHT:g}% and refused: {len(refused)} of {len(right)}; without a model: "
+    ratios = np.concatenate([part.ratios for row in rows for part in row.parts] or [np.zeros(0)])
+    known = ratios[np.isfinite(ratios)]
+    shares = ", ".join(f"{np.percentile(known, share):.1f}" for share in (50, 75, 90)) if len(
+        known) else "-"
+    return (f"over {WRONG:g}% of the extent and trusted: {len(trusted)} of {len(wrong)}, "
+            f"{len(silent)} of them without a rough camera; cameras off by times what is thought "
+            f"(50, 75, 90%): {shares}; under {RIGHT:g}% and refused: {len(refused)} of {len(right)}; without a model: "
             f"{sum(not row.judged for row in rows)} of {len(rows)}")
 
 

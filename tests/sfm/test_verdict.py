@@ -186,7 +186,7 @@ def test_the_keys_of_a_verdict_on_disk_stay(tmp_path):
     assert list(value) == [
         "images", "registered", "model_parts", "match_parts", "weak_link", "fold", "astray",
         "unregistered", "jumps", "keypoints", "points", "neighbours", "still", "scale",
-        "open_loops", "problems", "lenses", "camera_errors", "trusted", "rough"]
+        "open_loops", "problems", "lenses", "camera_errors", "rough", "trusted"]
     assert value["trusted"] is False
 
 
