@@ -13,7 +13,7 @@ from recon_cli.stages import STAGES
 MAX_LINES = 500
 
 # Each part of the package (a module or folder at its top) and the parts that it may import.
-BASE = {"deadline", "errors", "progress", "machine", "processes", "signals"}
+BASE = {"deadline", "errors", "plugins", "progress", "machine", "processes", "signals"}
 RECORDS = BASE | {"workspace", "config", "scene"}
 READ = RECORDS | {"io"}
 DRAW = READ | {"context", "kernels", "render", "evaluation", "stereo", "splats"}
@@ -22,6 +22,7 @@ RUN = MAKE | {"pipeline"}
 ALLOWED: dict[str, set[str]] = {
     "deadline": set(),
     "errors": set(),
+    "plugins": set(),
     "processes": set(),
     "signals": {"errors"},
     "progress": {"errors"},

@@ -1,7 +1,7 @@
 """Which pictures below a folder are the photos of a capture, and the other files there.
 
 All pictures below the folder are photos, but for masks, depth and the like, reduced copies, and
-the pictures that `capture.foreign` lists. Those left out are named, with the command to type.
+the pictures that `capture.known_files` lists. Those left out are named, with the command to type.
 """
 
 from __future__ import annotations
@@ -13,12 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from recon_cli.capture.archives import is_archive
-from recon_cli.capture.foreign import Found, find_foreign
 from recon_cli.capture.images import PHOTO_SUFFIXES, inspect_photo
-from recon_cli.capture.mask_files import FOLDERS as MASK_FOLDERS
-from recon_cli.capture.mask_files import is_mask_file
-from recon_cli.capture.picture_names import picture_kind
+from recon_cli.capture.known_files import Found, find_foreign, is_archive, picture_kind
+from recon_cli.capture.masks import MASK_FOLDERS, is_mask_file
 from recon_cli.errors import InputError, list_names
 from recon_cli.workspace.layout import Workspace
 

@@ -12,9 +12,9 @@ from pathlib import Path, PurePosixPath
 from recon_cli.capture.depth_pictures import look_like_depth
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
+from recon_cli.capture.known_files import picture_kind
 from recon_cli.capture.panoramas import choose_projection
 from recon_cli.capture.photo_tree import find_videos
-from recon_cli.capture.picture_names import picture_kind
 from recon_cli.errors import InputError, format_count, list_names
 from recon_cli.io.views import evenly_spread
 

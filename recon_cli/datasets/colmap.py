@@ -13,14 +13,8 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.exported_files import read_points
 from recon_cli.datasets.file_finder import FileFinder
-from recon_cli.datasets.posed import (
-    SUFFIXES,
-    PosedImage,
-    PosedSet,
-    find_images,
-    is_file,
-    resolve_inside,
-)
+from recon_cli.datasets.frame_table import FrameTable
+from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, is_file, resolve_inside
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, NamedImage, count_images, model_suffix, read_model
 from recon_cli.io.images import decode_file
@@ -118,13 +112,6 @@ def is_colmap(folder: Path) -> bool:
     return _find_model(folder) is not None
 
 
-def lacks_cameras(folder: Path) -> bool:
-    """Returns whether a folder holds images of a COLMAP model, but none of its cameras."""
-    return not is_colmap(folder) and any(
-        (folder / place / f"{part}{suffix}").is_file()
-        for place, _ in _PLACES for part in ("images", "frames") for suffix in (".bin", ".txt"))
-
-
 def read_colmap(folder: Path) -> PosedSet:
     """Returns a COLMAP model with its images; InputError if none exist, FormatError if damaged."""
     place = _find_model(folder)
@@ -143,14 +130,16 @@ def read_colmap(folder: Path) -> PosedSet:
         notices = (f"the model lacks the names of its {len(named)} images; they were taken in the "
                    "order of the files, and their colours agree with it",)
         paths = {name: home / name for name, _, _ in named}
-    listed = [PosedImage(name, paths[name], model.lenses[camera], viewmat)
-              for name, camera, viewmat in sorted(named, key=lambda image: image[0])
-              if name in paths]
-    missing = sorted(name for name, _, _ in named if name not in paths)
-    posed = find_images("colmap", listed, model_at, missing=missing)
+    table = FrameTable("colmap", model_at, pictures=home)
+    for name, camera, viewmat in sorted(named, key=lambda image: image[0]):
+        if name in paths:
+            table.add(PosedImage(name, paths[name], model.lenses[camera], viewmat))
+        else:
+            table.missing.append(name)
+    table.notices += [*model_notices, *notices]
+    posed = table.finish()
     if len(model.points):
         posed = replace(posed, points=model.points, colors=model.colors)
-    posed = replace(posed, notices=(*model_notices, *notices, *posed.notices))
     # INRIA's trainer and those after it start from it, and write it of the model's own points.
     file = model_at / "points3D.ply"
     return read_points(posed, file) if is_file(file) else posed

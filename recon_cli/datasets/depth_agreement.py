@@ -53,7 +53,7 @@ _ORDERS: dict[str, Turn] = {
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DepthView:
     """Depth, not all of it 0, and the camera that it is of."""
 
     depth: NDArray[np.float32]  # [h, w] as it is read
@@ -88,7 +88,7 @@ def fit_depth(
     viewmats = [image.viewmat for image in images]
 
     @cache
-    def read(at: int) -> View | None:
+    def read(at: int) -> DepthView | None:
         return _read(images[at])
 
     sources = [_ask_pairs(viewmats, read, _AS_READ),
@@ -145,7 +145,7 @@ def _error(estimates: Sequence[_Estimate], scale: float) -> float:
 
 
 def _find_order(
-    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], View | None], error: float
+    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], DepthView | None], error: float
 ) -> str:
     """Returns the fault of depth whose rows or columns are in another order, empty if none is."""
     if error <= _GOOD:
@@ -158,7 +158,7 @@ def _find_order(
     return ""
 
 
-def compare_views(views: Sequence[View]) -> float:
+def compare_views(views: Sequence[DepthView]) -> float:
     """Returns how far depth from different places is apart, relatively, as a median."""
     viewmats = [view.viewmat for view in views]
     errors = []
@@ -177,7 +177,7 @@ def _spread(count: int) -> list[int]:
 
 
 def _ask_points(
-    points: NDArray[np.float64], views: Iterator[View | None]
+    points: NDArray[np.float64], views: Iterator[DepthView | None]
 ) -> list[_Estimate]:
     """Returns the scale of the depth of each view by points that it sees, most of them."""
     estimates = []
@@ -200,7 +200,7 @@ def _compare_ratios(
 
 
 def _ask_pairs(
-    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], View | None], turn: Turn
+    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], DepthView | None], turn: Turn
 ) -> list[_Estimate]:
     """Returns the scale by which the depth of an image fits that of another, where it shows.
 
@@ -234,7 +234,7 @@ def _list_partners(
             yield order[(1 << rank) - 1]
 
 
-def _read(image: PosedImage) -> View | None:
+def _read(image: PosedImage) -> DepthView | None:
     """Returns the depth of an image where it is certain; None where it is damaged or empty."""
     assert image.depth is not None
     try:
@@ -246,10 +246,10 @@ def _read(image: PosedImage) -> View | None:
     if not depth.any():
         return None
     lens = image.depth.own_lens(*depth.shape[::-1])
-    return View(cv2.medianBlur(depth, _MEDIAN), lens, image.viewmat)
+    return DepthView(cv2.medianBlur(depth, _MEDIAN), lens, image.viewmat)
 
 
-def _fit_pair(one: View, other: View, turn: Turn) -> _Estimate | None:
+def _fit_pair(one: DepthView, other: DepthView, turn: Turn) -> _Estimate | None:
     """Returns the scale that fits a pair best, None if others fit it about as well."""
     moved = float(np.linalg.norm((other.viewmat @ np.linalg.inv(one.viewmat))[:3, 3]))
     scales = moved / float(np.median(one.depth[one.depth > 0])) * np.geomspace(
@@ -267,7 +267,7 @@ def _fit_pair(one: View, other: View, turn: Turn) -> _Estimate | None:
 
 
 def _compare(
-    one: View, other: View, turn: Turn, scales: NDArray[np.float64]
+    one: DepthView, other: DepthView, turn: Turn, scales: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Returns the median relative error [S] of depth that one image predicts for another.
 
@@ -284,16 +284,17 @@ def _compare(
     points = np.column_stack([rays[good] * z[good, None], z[good]])
     motion = other.viewmat @ np.linalg.inv(one.viewmat)
     seen = scales[:, None, None] * (points @ motion[:3, :3].T) + motion[:3, 3]
-    found = _look_up(View(turn(other.depth), other.lens, other.viewmat), seen) * scales[:, None]
+    there = DepthView(turn(other.depth), other.lens, other.viewmat)
+    depths = _look_up(there, seen) * scales[:, None]
     errors = np.full(len(scales), np.inf)
-    for at, (expected, there) in enumerate(zip(seen[..., 2], found, strict=True)):
-        known = there > 0
+    for at, (expected, actual) in enumerate(zip(seen[..., 2], depths, strict=True)):
+        known = actual > 0
         if known.sum() >= max(1, min(_FEWEST, len(rows) // 4)):
-            errors[at] = np.median(np.abs(expected[known] / there[known] - 1))
+            errors[at] = np.median(np.abs(expected[known] / actual[known] - 1))
     return errors
 
 
-def _look_up(view: View, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+def _look_up(view: DepthView, seen: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the depth of a view where its camera sees points [..., 3], 0 where it does not.
 
     Distortion is left out: it moves few pixels to another surface.

@@ -239,7 +239,7 @@ def test_photos_that_are_elsewhere_are_counted(frames, tmp_path):
     told(read_posed(tmp_path), "missing: 1 of the 4 images")
     for path in tmp_path.glob("*.jpg"):
         path.unlink()
-    refused(tmp_path, "4 photos that it lists are not there")
+    refused(tmp_path, "lists 4 pictures, but none of their files is there")
 
 
 def test_photos_are_found_by_other_suffixes_and_paths(frames, tmp_path):
