@@ -296,7 +296,7 @@ def find_lists(folder: Path, names: Sequence[str], *, known: Collection[Path]) -
              if path.suffix.lower() in _TEXTS and path not in known)
     lists = []
     for path in texts if wanted else ():
-        data = _head(path)
+        data = read_head(path)
         if sum(name in data for name in wanted) >= _LISTED * len(wanted):
             lists.append(path)
     return lists
@@ -306,11 +306,11 @@ def has_marks(path: Path, marks: Sequence[bytes]) -> bool:
     """Returns whether a path is a file that holds all of some bytes near its beginning."""
     if not marks:
         return path.is_file()
-    data = _head(path)
+    data = read_head(path)
     return all(mark in data for mark in marks)
 
 
-def _head(path: Path, size: int = _READ) -> bytes:
+def read_head(path: Path, size: int = _READ) -> bytes:
     """Returns the first bytes of a regular file; none where it cannot be read."""
     with suppress(OSError):
         if path.is_file():
@@ -385,7 +385,7 @@ def _ingest_beside(path: Path) -> str:
 
 def _unpacking(path: Path) -> str | None:
     """Returns the command that unpacks an archive, None for other files."""
-    head = _head(path, 512)
+    head = read_head(path, 512)
     return next((command for mark, at, command in _SIGNATURES
                  if head[at:at + len(mark)] == mark), None)
 

@@ -20,16 +20,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.images import Photo, read_alpha, read_rgb
+from recon_cli.capture.images import PHOTO_SUFFIXES, RAW_SUFFIXES, Photo, read_alpha, read_rgb
 from recon_cli.errors import InputError
 from recon_cli.workspace import atomic
 
 HALF = 128  # from this value on a pixel is white, or opaque
 MASK_FOLDERS = ("masks", "mask", ".mask")
 _LAYER = ".mask"  # before the suffix of a mask
-_SUFFIXES = frozenset({
-    ".avif", ".bmp", ".heic", ".heif", ".hif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png",
-    ".ppm", ".tif", ".tiff", ".webp"})
+_SUFFIXES = PHOTO_SUFFIXES - RAW_SUFFIXES - {".jxl"}
 Key = TypeVar("Key")
 
 

@@ -35,7 +35,6 @@ _SEAM, _OPPOSITE, _POLE = 3.0, 3.0, 0.5
 # Wider pictures have no pole: at 2.2, 3 and 4:1 74 to 100 of 100 panoramas pass without it, and at
 # most 3 of 100 photos of seven captures.
 _LEAST, _SHARE = 3, 0.5  # of the checked pictures must pass where no metadata says it
-_NAMED = 4
 _ASPECT = 0.02  # of an asked-for panorama, which cameras crop by some pixels
 
 
@@ -81,7 +80,7 @@ def _drop_double(folder: str, photos: Sequence[Photo]) -> tuple[list[Photo], lis
                 f"{doubles[0].name}.",
                 hint=f"{advice} --camera perspective uses them as ordinary photos.")
         if doubles:
-            names = list_names([photo.name for photo in doubles], _NAMED)
+            names = list_names([photo.name for photo in doubles])
             notices.append(f"{len(doubles)} {kind} are left out: {names}. {advice}")
     return singles, notices
 
@@ -122,7 +121,7 @@ def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Cho
             f"{len(round_about)} pictures are used as 360-degree panoramas (equirectangular); "
             "--camera perspective uses them as ordinary photos.",
             *([f"{len(left_out)} pictures are left out, because they are not panoramas as the "
-               f"others are: {list_names(left_out, _NAMED)}."] if left_out else [])))
+               f"others are: {list_names(left_out)}."] if left_out else [])))
     if found and len(others) < MIN_FRAMES:
         raise InputError(
             f"{len(found)} of the {len(photos)} pictures in {folder} are panoramas, such as "
@@ -135,7 +134,7 @@ def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Cho
         names = [photo.name for photo in found]
         return ChosenPhotos(tuple(others), False, (
             f"{len(names)} panoramas are left out, because they are not pictures of ordinary "
-            f"lenses as the others are: {list_names(names, _NAMED)}. To use them, give them in a "
+            f"lenses as the others are: {list_names(names)}. To use them, give them in a "
             "folder of their own.",))
     return ChosenPhotos(tuple(others), panoramas=False)
 

@@ -29,7 +29,6 @@ _PICTURE_FOLDERS = frozenset({
     "rgb", "rgbd"})
 _SAME_NAMES = 0.5  # a subfolder of which more pictures are called like those above holds copies
 _VERSIONS = "other versions of these photos"
-_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def _describe_home(folder: Path, home: Path, walk: _Walk) -> Iterator[str]:
     deeper = [place for place in walk.folders if place != home]
     if deeper:
         count = sum(len(walk.folders[place]) for place in deeper)
-        names = list_names([f"{_relative(place, home)}/" for place in sorted(deeper)], _NAMED)
+        names = list_names([f"{_relative(place, home)}/" for place in sorted(deeper)])
         yield (f"{count} photos in subfolders are used too: {names}. To use only some, give their "
                f"folders, or files such as {shlex.quote(str(home))}/*.jpg.")
 
@@ -150,17 +149,17 @@ def _describe_media(folders: Sequence[Path]) -> Iterator[str]:
     files = [path for folder in folders for path in _files(folder)]
     videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
     if videos:
-        names = list_names([path.name for path in videos], _NAMED)
+        names = list_names([path.name for path in videos])
         yield (f"Not used beside photos are videos: {names}. recon ingest "
                f"{shlex.quote(str(folders[0]))} {shlex.quote(str(videos[0]))} uses "
                f"{'both' if len(videos) == 1 else 'the first, too'}.")
     arrays = [path.name for path in files if path.suffix.lower() in (".exr", ".pfm")]
     if arrays:
         yield (f"Not used are {len(arrays)} pictures of depth or high range: "
-               f"{list_names(arrays, _NAMED)}.")
+               f"{list_names(arrays)}.")
     archives = [path.name for path in files if is_archive(path)]
     if archives:
-        yield (f"Not used are archives: {list_names(archives, _NAMED)}. Unpack them if they hold "
+        yield (f"Not used are archives: {list_names(archives)}. Unpack them if they hold "
                "photos of the scene.")
 
 

@@ -59,7 +59,7 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
             break
     depths, levels = (list_timed(home / name) for name in ("lowres_depth", "confidence"))
     trajectory = _read_trajectory(home / _TRAJ)
-    table = FrameTable("arkitscenes", folder, pictures=home / kind)
+    table = FrameTable(folder, pictures=home / kind)
     for time, path in images.items():
         with table.frame(path.name):
             lens = _read_lens(nearest(inner, time, _NEAR), path, table)

@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.known_files import read_head
 from recon_cli.datasets.exported_files import thin_cloud
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.frame_files import parse_numbers
@@ -36,12 +37,8 @@ def is_bundler(path: Path) -> bool:
 
 def _find(path: Path) -> Path | None:
     files = [path] if path.is_file() else sorted([*path.glob("*.out"), *path.glob("*/bundle.out")])
-    for file in files:
-        if file.suffix == ".out" and file.is_file():
-            with file.open("rb") as stream:
-                if stream.read(len(_MARK)) == _MARK and _list_file(file) is not None:
-                    return file
-    return None
+    return next((file for file in files if file.suffix == ".out"
+                 and read_head(file, len(_MARK)) == _MARK and _list_file(file) is not None), None)
 
 
 def _list_file(file: Path) -> Path | None:
@@ -66,7 +63,7 @@ def read_bundler(path: Path) -> PosedSet:
         raise FormatError(
             f"{file} has {cameras} cameras, but {list_file.name} names {len(names)} images.",
             hint="Copy the list that belongs to it.")
-    table = FrameTable("bundler", folder)
+    table = FrameTable(folder)
     finder = FileFinder(folder, names)
     for name in names:
         (focal, k1, k2), rows, shift = _take(lines, 3, file), [

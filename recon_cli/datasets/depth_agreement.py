@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from recon_cli.datasets.posed import PosedImage
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import undistort_pixels
-from recon_cli.io.depth_maps import MOST_NOISE
+from recon_cli.io.depth_maps import MEDIAN, MOST_NOISE
 from recon_cli.scene.camera import Lens
 
 # Units of a stored value, in metres: what cameras and data sets write.
@@ -37,7 +37,6 @@ _LEAST_MOVED, _MOST_MOVED, _MOST_TURNED_DEG = 0.2, 1.0, 40.0
 _GRID = 40  # samples a side of a depth map
 _FEWEST = 100  # samples of a pair that both see
 _LEAST_POINTS = 20  # of a view
-_MEDIAN = 5  # pixels a side of the median that takes a sensor's noise, and leaves edges
 _STEPS, _FINE = 9, np.geomspace(0.8, 1.25, 21)  # of the scales that are tried: 22%, then 2%
 # A scale shows, or is better than another one, if the other's error is this many times its own.
 _SHOWN = 1.5
@@ -246,7 +245,7 @@ def _read(image: PosedImage) -> DepthView | None:
     if not depth.any():
         return None
     lens = image.depth.own_lens(*depth.shape[::-1])
-    return DepthView(cv2.medianBlur(depth, _MEDIAN), lens, image.viewmat)
+    return DepthView(cv2.medianBlur(depth, MEDIAN), lens, image.viewmat)
 
 
 def _fit_pair(one: DepthView, other: DepthView, turn: Turn) -> _Estimate | None:
@@ -294,7 +293,7 @@ def _compare(
     return errors
 
 
-def _look_up(view: DepthView, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+def _look_up(view: DepthView, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the depth of a view where its camera sees points [..., 3], 0 where it does not.
 
     Distortion is left out: it moves few pixels to another surface.
@@ -303,9 +302,9 @@ def _look_up(view: DepthView, seen: NDArray[np.float64]) -> NDArray[np.float64]:
     fx, fy, cx, cy = params[:4] if len(params) > 3 else (params[0], *params[:3])
     height, width = view.depth.shape
     with np.errstate(divide="ignore", invalid="ignore"):
-        u = seen[..., 0] / seen[..., 2] * fx + cx
-        v = seen[..., 1] / seen[..., 2] * fy + cy
-        inside = (seen[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    found = np.zeros(inside.shape)
-    found[inside] = view.depth[v[inside].astype(int), u[inside].astype(int)]
-    return found
+        u = points[..., 0] / points[..., 2] * fx + cx
+        v = points[..., 1] / points[..., 2] * fy + cy
+        inside = (points[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    depths = np.zeros(inside.shape)
+    depths[inside] = view.depth[v[inside].astype(int), u[inside].astype(int)]
+    return depths

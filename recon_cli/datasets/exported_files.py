@@ -143,13 +143,13 @@ def _without_last(
     corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
     r = np.linspace(0, corner, 200)
     powers = r[:, None]**np.array([3, 5, 7, 9]) * fx  # pixels along the radius
-    wanted = powers @ radial
-    if not np.isfinite(wanted).all():
+    offsets = powers @ radial
+    if not np.isfinite(offsets).all():
         raise FormatError(f"{where} has coefficients of distortion that are not finite.")
-    found = np.linalg.lstsq(powers[:, :3], wanted, rcond=None)[0]
-    off = float(np.abs(powers[:, :3] @ found - wanted).max())
+    fitted = np.linalg.lstsq(powers[:, :3], offsets, rcond=None)[0]
+    off = float(np.abs(powers[:, :3] @ fitted - offsets).max())
     if off > _MOST_OFF:
         raise FormatError(
             f"{where} has k4 = {radial[3]:g}, a term of r^8 that moves points by up to {off:.1f} "
             "pixels, and cannot be used.", hint="Export undistorted images, or fit without k4.")
-    return np.asarray(found)
+    return np.asarray(fitted)

@@ -80,15 +80,15 @@ class FileFinder:
 
     def find_all(self, where: str) -> dict[str, Path]:
         """Returns the files of the names in the list that have one, each of one name alone."""
-        found = {}
+        files = {}
         for name in self._names:
             with suppress(FormatError):
                 path = self.find(name, where)
                 if is_file(path):
-                    found[str(name)] = path
-        twice = {path for path, count in Counter(found.values()).items() if count > 1}
+                    files[str(name)] = path
+        twice = {path for path, count in Counter(files.values()).items() if count > 1}
         self._moved = {name: path for name, path in self._moved.items() if path not in twice}
-        return {name: path for name, path in found.items() if path not in twice}
+        return {name: path for name, path in files.items() if path not in twice}
 
     def notices(self) -> list[str]:
         """Returns a notice where files were found by their names alone."""

@@ -78,6 +78,12 @@ def _list_files(
     return sorted(files.items())
 
 
+def list_reduced(folder: Path) -> list[Path]:
+    """Returns images_2, images_4 and so on, the largest images first."""
+    folders = [path for path in folder.glob("images_*") if path.name[7:].isdecimal()]
+    return sorted(folders, key=lambda path: int(path.name[7:]))
+
+
 def read_rows(path: Path) -> list[tuple[str, list[str]]]:
     """Returns the place and the words of each line that is neither empty nor a comment.
 

@@ -53,7 +53,7 @@ class FrameTable:
     """The frames of a data set, in its order, and those that are left out."""
 
     def __init__(
-        self, layout: str, folder: Path, *, pictures: Path | str = "", opengl: bool = False
+        self, folder: Path, *, pictures: Path | str = "", opengl: bool = False
     ) -> None:
         """Opens an empty table.
 
@@ -63,7 +63,7 @@ class FrameTable:
         self.rows: list[PosedImage] = []
         self.missing: list[str] = []  # names of pictures that the set lists, and that are not there
         self.notices: list[str] = []
-        self._layout, self._folder, self._opengl = layout, folder, opengl
+        self._folder, self._opengl = folder, opengl
         self._pictures = quoted(pictures or folder)
         self._name = ""
         self._left_out: dict[str, list[str]] = {}
@@ -154,7 +154,7 @@ class FrameTable:
         notices += self.notices
         if without_picture:
             notices.append(f"without a picture: {without_picture} of its poses")
-        return PosedSet(self._layout, images, missing, notices=tuple(notices))
+        return PosedSet("", images, missing, notices=tuple(notices))
 
     def finish_tracked(
         self, *, up: tuple[float, float, float] | None = Y_UP, without_picture: int = 0

@@ -82,7 +82,7 @@ def read_seven_scenes(folder: Path) -> PosedSet:
         raise InputError(
             f"{folder} has {len(colors)} frames like frame-000000.color.png, none of them with a "
             ".pose.txt.", hint="Unpack the complete sequence into one folder.")
-    table = FrameTable("7scenes", folder, pictures=f"{quoted(folder)}/frame-*.color.*")
+    table = FrameTable(folder, pictures=f"{quoted(folder)}/frame-*.color.*")
     lens, depth_lens = _kinect(folder, image_size(next(iter(colors.values()))), table)
     for number, path in colors.items():
         with table.frame(path.name):
@@ -131,7 +131,7 @@ def read_tum(folder: Path) -> PosedSet:
     trajectory = _read_trajectory(folder / "groundtruth.txt")
     depths = dict(reversed(
         _read_list(folder, "depth.txt") if (folder / "depth.txt").is_file() else []))
-    table = FrameTable("tum", folder, pictures=folder / "rgb")
+    table = FrameTable(folder, pictures=folder / "rgb")
     for time, path in colors:
         with table.frame(path.name):
             viewmat = trajectory.viewmat(time)

@@ -137,7 +137,8 @@ def read_posed(path: Path) -> PosedSet:
         raise InputError(f"{path} is not a data set with poses.", hint=f"Known are {known}.")
     try:
         folder = path if path.is_dir() else path.parent
-        return _attach_masks(apply_lists(layout.read(path), folder), folder)
+        posed = replace(layout.read(path), layout=layout.name)
+        return _attach_masks(apply_lists(posed, folder), folder)
     except FormatError as error:
         if error.hint:
             raise
@@ -175,21 +176,21 @@ def _attach_masks(posed: PosedSet, folder: Path) -> PosedSet:
         image.path.parents[len(PurePosixPath(image.name).parts) - above] for image in posed.images
         if image.path.is_relative_to(folder) and len(image.path.relative_to(folder).parts)
         > len(PurePosixPath(image.name).parts) for above in (0, 1))])
-    found: dict[str, Path] = {}
+    masks: dict[str, Path] = {}
     unused: list[str] = []
     for place in dict.fromkeys(place for home in homes for place in mask_folders(home)):
-        masks, left = match_masks(place, bare)
-        found = {**masks, **found}
+        matches, left = match_masks(place, bare)
+        masks = {**matches, **masks}
         unused += [name for name in left if place / name not in listed]
-    images = tuple(replace(image, mask=found[image.name]) if image.name in found else image
+    images = tuple(replace(image, mask=masks[image.name]) if image.name in masks else image
                    for image in posed.images)
     notices = list(posed.notices)
-    if found:
-        notices.append(f"{len(found)} of its images have masks")
+    if masks:
+        notices.append(f"{len(masks)} of its images have masks")
     if unused:
         first = posed.images[0].name
         notices.append(
             f"masks without an image are left out: {list_names(unused)}"
             + f"; that of {first} must be called {first}.png or "
-            f"{PurePosixPath(first).with_suffix('.png')}" * (not found))
+            f"{PurePosixPath(first).with_suffix('.png')}" * (not masks))
     return replace(posed, images=images, notices=tuple(notices))

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.datasets.frame_files import list_reduced
 from recon_cli.datasets.frame_table import FrameTable, LeftOutError
 from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import make_lens
 
 _FILE = "poses_bounds.npy"
-_PLACES = ("images", "input", "rgb", ".")
+_PLACES = ("images", "input", "rgb")
 _NUMBERS = (17, 15)  # with the bounds, and without
 
 
@@ -43,7 +44,7 @@ def read_llff(folder: Path) -> PosedSet:
             f"{folder / _FILE} has {len(rows)} poses, but {home.name}/ {len(images)} images: "
             "nothing says which belong together.",
             hint="Copy all images of the scene; poses and names have one order.")
-    table = FrameTable("llff", folder, pictures=home)
+    table = FrameTable(folder, pictures=home)
     for at, (row, path) in enumerate(zip(rows, images, strict=True)):
         with table.frame(path.name):
             viewmat = table.pose(_pose, row)
@@ -77,10 +78,9 @@ def _pose(row: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _choose_images(folder: Path, count: int) -> Path:
     """Returns the folder of the images; with a count, the one that has so many, if there is."""
-    reduced = sorted((path for path in folder.glob("images_*") if path.name[7:].isdecimal()),
-                     key=lambda path: int(path.name[7:]))
-    places = [place for place in (*(folder / name for name in _PLACES[:3]), *reduced, folder)
-              if place.is_dir() and _list_images(place)]
+    places = [place for place in (
+        *(folder / name for name in _PLACES), *list_reduced(folder), folder)
+        if place.is_dir() and _list_images(place)]
     if not places:
         raise InputError(f"{folder} holds {_FILE}, but no images.",
                          hint=f"Put the images into {folder / 'images'}.")

@@ -9,6 +9,7 @@ nerfstudio's issue 2294.)
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -17,6 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.known_files import read_head
 from recon_cli.datasets.exported_files import find_points, radial_lens, shift_far
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.frame_files import parse_numbers
@@ -27,7 +29,7 @@ from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.atomic import read_text
 
-_MARKS = (b"<document", b"<chunk", b"<camera")
+_MARKS = re.compile(rb"(?=.*<document)(?=.*<chunk)(?=.*<(?:sensor|camera))", re.DOTALL)
 _HEAD = 1 << 16  # bytes; sensors come before cameras
 _SKEW = 0.5  # pixels that leaving out b2 may move the border
 # On the earth's surface, from its centre: coordinates whose up is not z.
@@ -42,14 +44,9 @@ def is_metashape(path: Path) -> bool:
 
 
 def _find(path: Path) -> Path | None:
-    for file in [path] if path.is_file() else sorted(path.glob("*.xml")):
-        if file.suffix.lower() == ".xml" and file.is_file():
-            with file.open("rb") as stream:
-                head = stream.read(_HEAD)
-            if all(mark in head for mark in _MARKS[:2]) and (
-                    b"<sensor" in head or _MARKS[2] in head):
-                return file
-    return None
+    files = [path] if path.is_file() else sorted(path.glob("*.xml"))
+    return next((file for file in files if file.suffix.lower() == ".xml"
+                 and _MARKS.match(read_head(file, _HEAD))), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +69,7 @@ def read_metashape(path: Path) -> PosedSet:
         found = _read_worlds(chunk, file)
         cameras += _list_cameras(chunk, at, file, found)
         worlds |= {(at, key): world for key, world in found.items()}
-    table = FrameTable("metashape", folder)
+    table = FrameTable(folder)
     for aligned in _by_component(cameras, worlds, table):
         finder = FileFinder(folder, [camera.path for camera in aligned])
         taken = {image.path for image in table.rows}
@@ -176,11 +173,11 @@ def _numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
 
 def _similarity(node: ElementTree.Element, file: Path) -> Similarity | None:
     """Returns what takes a chunk or component to the world, None where it does not say."""
-    found = node.find("transform")
-    if found is None:
+    transform = node.find("transform")
+    if transform is None:
         return None
     where = f"{file}, the transform of {node.tag} {node.get('id', '')},"
-    rotation, shift, scale = (found.findtext(key) for key in ("rotation", "translation", "scale"))
+    rotation, shift, scale = map(transform.findtext, ("rotation", "translation", "scale"))
     matrix = np.eye(3) if rotation is None else _numbers(rotation, 9, where).reshape(3, 3)
     left, _, right = np.linalg.svd(matrix)
     if np.abs(left @ right - matrix).max() > 1e-3:
@@ -218,15 +215,15 @@ def _sensor_lens(camera: _Camera) -> Lens:
 
 def _make_lens(sensor: ElementTree.Element, kind: str, where: str) -> Lens:
     calibrations = sensor.findall("calibration")
-    chosen = next((one for one in calibrations if one.get("class") == "adjusted"),
+    calibration = next((one for one in calibrations if one.get("class") == "adjusted"),
                   calibrations[-1] if calibrations else None)
-    size = chosen.find("resolution") if chosen is not None else None
+    size = calibration.find("resolution") if calibration is not None else None
     size = sensor.find("resolution") if size is None else size
-    if chosen is None or size is None:
+    if calibration is None or size is None:
         raise FormatError(f"{where} has no calibration.")
 
     def number(key: str) -> float:
-        text = chosen.findtext(key)
+        text = calibration.findtext(key)
         return 0.0 if text is None else float(_numbers(text, 1, f"{where} {key}")[0])
 
     try:

@@ -32,9 +32,8 @@ def is_nerfcapture(path: Path) -> bool:
 def read_nerfcapture(path: Path) -> PosedSet:
     """Returns the frames in order of time; errors are those of a transforms.json."""
     posed = read_transforms(path)
-    table = FrameTable(
-        "nerfcapture", path if path.is_dir() else path.parent,
-        pictures=posed.images[0].path.parent)
+    table = FrameTable(path if path.is_dir() else path.parent,
+                       pictures=posed.images[0].path.parent)
     for image in sorted(posed.images, key=_order):
         with table.frame(image.name):
             lens = image.lens

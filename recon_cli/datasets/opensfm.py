@@ -60,7 +60,7 @@ def read_opensfm(folder: Path) -> PosedSet:
         assert path is not None
         value, notices = {}, []
         cameras, shots = read_json(folder / "cameras.json", dict), _features(path)
-    table = FrameTable("opensfm", folder, pictures=folder / "images")
+    table = FrameTable(folder, pictures=folder / "images")
     finder = FileFinder(folder, [shot[0] for shot in shots])
     for name, camera, turn, position in shots:
         with table.frame(PurePosixPath(name).name):
@@ -77,14 +77,14 @@ def read_opensfm(folder: Path) -> PosedSet:
 
 def _largest(path: Path) -> tuple[dict[str, Any], list[str]]:
     """Returns the reconstruction with the most images, and a notice of the others."""
-    found = [one for one in read_json(path, list)
-             if isinstance(one, dict) and isinstance(one.get("shots"), dict)]
-    if not found:
+    models = [one for one in read_json(path, list)
+              if isinstance(one, dict) and isinstance(one.get("shots"), dict)]
+    if not models:
         raise FormatError(f"{path} holds no reconstruction.")
-    best = max(found, key=lambda one: len(one["shots"]))
-    others = sum(len(one["shots"]) for one in found if one is not best)
-    return best, [f"{others} images of {len(found) - 1} other reconstructions, which did not "
-                  "connect, are left out"] * (len(found) > 1)
+    best = max(models, key=lambda one: len(one["shots"]))
+    others = sum(len(one["shots"]) for one in models if one is not best)
+    return best, [f"{others} images of {len(models) - 1} other reconstructions, which did not "
+                  "connect, are left out"] * (len(models) > 1)
 
 
 def _shots(value: Mapping[str, Any], path: Path) -> list[Shot]:
@@ -106,11 +106,11 @@ def _features(path: Path) -> list[Shot]:
     shots = []
     for feature in value.get("features") or []:
         try:
-            found = feature["properties"]
+            properties = feature["properties"]
             shots.append((
-                str(found["filename"]), str(found.get("camera", "")),
-                [float(one) for one in found["rotation"]],
-                np.array([float(one) for one in found["translation"]])))
+                str(properties["filename"]), str(properties.get("camera", "")),
+                [float(one) for one in properties["rotation"]],
+                np.array([float(one) for one in properties["translation"]])))
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(f"{path} has a shot without a pose.") from error
     return shots

@@ -53,7 +53,7 @@ def read_polycam(folder: Path) -> PosedSet:
         if images and cameras:
             break
     depths, levels = (list_numbered(place / name, (".png",)) for name in ("depth", "confidence"))
-    table = FrameTable("polycam", folder, pictures=place / f"{kind}images", opengl=True)
+    table = FrameTable(folder, pictures=place / f"{kind}images", opengl=True)
     for number in dict.fromkeys([*images, *cameras]):
         path = images.get(number)
         with table.frame(f"{cameras[number].stem}.jpg" if path is None else path.name):

@@ -50,7 +50,7 @@ class PosedImage:
 class PosedSet:
     """A data set with poses."""
 
-    layout: str  # the name of one of `layouts.LAYOUTS`
+    layout: str  # the name of one of `layouts.LAYOUTS`, which `layouts.read_posed` gives it
     images: tuple[PosedImage, ...]  # in the order of the data set
     missing: tuple[str, ...] = ()  # names of images that it lists, but whose files do not exist
     metric: bool = False  # its unit is the metre

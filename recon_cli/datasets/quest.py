@@ -47,7 +47,7 @@ def is_quest(folder: Path) -> bool:
 
 def read_quest(folder: Path) -> PosedSet:
     """Returns the frames of both cameras; InputError if none has an image and a pose."""
-    table = FrameTable("quest", folder, pictures=(
+    table = FrameTable(folder, pictures=(
         f"{quoted(folder)}, once its .rgba files are converted to pictures"))
     for eye in _EYES:
         if (folder / f"{eye}_camera_mruk_frame_metadata.csv").is_file():

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from recon_cli.capture.known_files import read_head
 from recon_cli.datasets.exported_files import find_points, radial_lens, shift_far
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.frame_files import HEAD_LINES, column_names, numbers, read_csv
@@ -26,6 +27,7 @@ from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.scene.camera import Lens
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+_HEAD = HEAD_LINES * 4096  # bytes
 _FILM = 36.0  # millimetres, of the longer side
 
 
@@ -36,14 +38,9 @@ def is_reality_scan(path: Path) -> bool:
 
 def _find(path: Path) -> Path | None:
     files = [path] if path.is_file() else sorted(path.glob("*.csv"))
-    for file in files:
-        if file.suffix.lower() == ".csv" and file.is_file():
-            with file.open("rb") as stream:
-                head = [stream.readline(4096).decode("utf-8-sig", errors="replace")
-                        for _ in range(HEAD_LINES)]
-            if any(set(column_names(line.split(","))) >= set(_NEEDED) for line in head):
-                return file
-    return None
+    return next((file for file in files if file.suffix.lower() == ".csv" and any(
+        set(column_names(line.split(","))) >= set(_NEEDED) for line in read_head(
+            file, _HEAD).decode("utf-8-sig", errors="replace").splitlines()[:HEAD_LINES])), None)
 
 
 def read_reality_scan(path: Path) -> PosedSet:
@@ -52,7 +49,7 @@ def read_reality_scan(path: Path) -> PosedSet:
     assert file is not None
     folder = file.parent
     rows = [row for row in read_csv(file, _NEEDED) if row.get("name")]
-    table = FrameTable("realityscan", folder, opengl=True)
+    table = FrameTable(folder, opengl=True)
     finder = FileFinder(folder, [row["name"] for row in rows])
     for row in rows:
         with table.frame(PurePosixPath(row["name"]).name):

@@ -54,7 +54,7 @@ def read_record3d(folder: Path) -> PosedSet:
     own = value.get("perFrameIntrinsicCoeffs") or []
     times = value.get("frameTimestamps") or []
     images = list_numbered(place / name)
-    table = FrameTable("record3d", folder, pictures=place / name, opengl=True)
+    table = FrameTable(folder, pictures=place / name, opengl=True)
     for number, path in images.items():
         with table.frame(path.name):
             if number >= len(poses):

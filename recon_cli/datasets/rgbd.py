@@ -43,7 +43,7 @@ def read_replica(folder: Path) -> PosedSet:
     InputError if there are no images; FormatError if a file is missing, damaged or does not fit.
     """
     lens, scale = _read_params(folder)
-    table = FrameTable("replica", folder, pictures=folder / "results")
+    table = FrameTable(folder, pictures=folder / "results")
     _add_sequence(table, folder, lens, scale)
     splits = (folder / "test" / "results").is_dir()
     if splits:
@@ -129,7 +129,7 @@ def read_scannet(folder: Path) -> PosedSet:
     lens = _read_lens(folder, "color", image_size(next(iter(colors.values()))))
     depths = list_numbered(folder / "depth", (".png",))
     own = _read_lens(folder, "depth", image_size(next(iter(depths.values())))) if depths else None
-    table = FrameTable("scannet", folder, pictures=folder / "color")
+    table = FrameTable(folder, pictures=folder / "color")
     for number, path in colors.items():
         with table.frame(path.name):
             viewmat = read_pose(poses.get(number))

@@ -45,18 +45,18 @@ def is_rtabmap(folder: Path) -> bool:
 
 def _find(folder: Path) -> list[tuple[str, str, Path, bool]]:
     """Returns name, suffix of the camera, file of poses, and whether these are the base's."""
-    found = []
+    cameras = []
     files = sorted(folder.glob("*_poses*.txt")) if folder.is_dir() else []
     for path in files:
         match = _POSES.fullmatch(path.name)
         if match and _pictures(folder, match[1]):
-            found.append((match[1], f"_{match[2]}" if match[2] else "", path, False))
-    if not found:
+            cameras.append((match[1], f"_{match[2]}" if match[2] else "", path, False))
+    if not cameras:
         for path in files:
             match = _BASE.fullmatch(path.name)
             if match and _pictures(folder, match[1]) and (folder / f"{match[1]}_calib").is_dir():
-                found.append((match[1], "", path, True))
-    return found
+                cameras.append((match[1], "", path, True))
+    return cameras
 
 
 def _pictures(folder: Path, name: str) -> Path | None:
@@ -70,7 +70,7 @@ def read_rtabmap(folder: Path) -> PosedSet:
     InputError if there is none; FormatError if the poses have no time stamps or are damaged.
     """
     cameras = _find(folder)
-    table = FrameTable("rtabmap", folder, pictures=_pictures(folder, cameras[0][0]) or folder)
+    table = FrameTable(folder, pictures=_pictures(folder, cameras[0][0]) or folder)
     unused = sum(_add_camera(table, folder, name, camera, path, base)
                  for name, camera, path, base in (cameras[:1] if cameras[0][3] else cameras))
     table.notices += [
@@ -224,8 +224,8 @@ def _fisheye(distortion: list[float]) -> list[float]:
 def _data(text: str, key: str) -> list[float]:
     """Returns the numbers of a matrix in OpenCV's YAML; empty where there is none."""
     block = re.search(rf"^{key}\s*:(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
-    found = re.search(rf"data{_NUMBERS}", block[1]) if block else None
+    numbers = re.search(rf"data{_NUMBERS}", block[1]) if block else None
     try:
-        return [float(one) for one in found[1].split(",")] if found else []
+        return [float(one) for one in numbers[1].split(",")] if numbers else []
     except ValueError:
         return []

@@ -37,8 +37,7 @@ def read_scanner_app(folder: Path) -> PosedSet:
     texts = list_numbered(folder, (".json",), "frame_([0-9]+)")
     depths, levels = (list_numbered(folder, (".png",), f"{kind}_([0-9]+)")
                       for kind in ("depth", "conf"))
-    table = FrameTable(
-        "3dscannerapp", folder, pictures=f"{quoted(folder)}/frame_*.jpg", opengl=True)
+    table = FrameTable(folder, pictures=f"{quoted(folder)}/frame_*.jpg", opengl=True)
     for number, path in images.items():
         with table.frame(path.name):
             value = read_object(texts.get(number), "without a .json")

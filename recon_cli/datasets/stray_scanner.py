@@ -52,7 +52,7 @@ def read_stray(folder: Path) -> PosedSet:
     video = folder / _VIDEO
     rows = read_csv(folder / _ODOMETRY, ("frame", *_POSE))
     size, count = _measure(video)
-    table = FrameTable("stray", folder, pictures=video)
+    table = FrameTable(folder, pictures=video)
     inner = _read_matrix(folder / _MATRIX, size, rows, table)
     depths = list_numbered(folder / "depth", (".png", ".npy"))  # .npy: old versions
     levels = list_numbered(folder / "confidence", (".png",))

@@ -148,7 +148,7 @@ def read_transforms(path: Path) -> PosedSet:
     literature scores it; if it names validation views alone, those are held out. InputError if no
     image exists; FormatError if a file is damaged or a frame incomplete.
     """
-    table, frames = FrameTable("transforms", path), list[_Frame]()
+    table, frames = FrameTable(path), list[_Frame]()
     lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
     finder = FileFinder(path.parent if path.is_file() else path, [
         entry[key] for _, _, (_, entries) in lists for entry in entries

@@ -45,7 +45,7 @@ def test_files_pair_by_number_or_by_the_nearest_time(tmp_path):
 
 
 def test_frames_are_left_out_by_reason_and_counted(tmp_path):
-    table = FrameTable("stray", tmp_path)
+    table = FrameTable(tmp_path)
     for name in ("a.png", "b.png"):
         posed_sets.write_image(tmp_path / name)
         add(table, tmp_path / name)
@@ -77,13 +77,13 @@ def test_frames_are_left_out_by_reason_and_counted(tmp_path):
 
 
 def test_an_error_that_is_no_reason_to_leave_a_frame_out_is_raised(tmp_path):
-    table = FrameTable("stray", tmp_path)
+    table = FrameTable(tmp_path)
     with pytest.raises(FormatError), table.frame("a"):
         raise FormatError("The whole list is damaged.")
 
 
 def test_pictures_of_one_name_are_called_by_their_paths(tmp_path):
-    table = FrameTable("bundler", tmp_path)
+    table = FrameTable(tmp_path)
     for place in ("x", "y"):
         posed_sets.write_image(tmp_path / place / "a.png")
         add(table, tmp_path / place / "a.png")
@@ -94,7 +94,7 @@ def test_pictures_of_one_name_are_called_by_their_paths(tmp_path):
 
 
 def test_lenses_and_depth_take_the_size_of_the_files(tmp_path):
-    table = FrameTable("colmap", tmp_path)
+    table = FrameTable(tmp_path)
     posed_sets.write_image(tmp_path / "a.png")
     width, height = read_size(tmp_path / "a.png")
     lens = make_lens("PINHOLE", 2 * width, 2 * height, (60, 60, width, height), "")
@@ -107,7 +107,7 @@ def test_lenses_and_depth_take_the_size_of_the_files(tmp_path):
 
 
 def test_a_table_without_a_frame_is_refused_with_what_to_type(tmp_path):
-    table = FrameTable("stray", tmp_path, pictures=tmp_path / "rgb.mp4")
+    table = FrameTable(tmp_path, pictures=tmp_path / "rgb.mp4")
     with pytest.raises(InputError, match="no frame with a pose") as caught:
         table.finish()
     assert f"recon ingest {tmp_path / 'rgb.mp4'}" in caught.value.hint
@@ -118,7 +118,7 @@ def test_a_table_without_a_frame_is_refused_with_what_to_type(tmp_path):
 
 
 def test_tracked_frames_that_never_moved_are_refused(tmp_path):
-    table = FrameTable("stray", tmp_path, opengl=True)
+    table = FrameTable(tmp_path, opengl=True)
     for name in ("a.png", "b.png"):
         posed_sets.write_image(tmp_path / name)
         add(table, tmp_path / name, place=1.0)

@@ -21,7 +21,7 @@ def fits(path):
 
 
 def read(path):
-    table = FrameTable("toy", path)
+    table = FrameTable(path)
     for row in json.loads((path / "toy.json").read_text()):
         with table.frame(row["file"]):
             pose = np.eye(4)
