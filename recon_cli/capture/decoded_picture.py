@@ -60,7 +60,7 @@ SAME_SHAPE = 0.02
 
 
 @dataclass(frozen=True)
-class Gap:
+class LostPacket:
     """A packet that gave no frame; `pts` is its place in the stream's time base, if known."""
 
     pts: int | None
@@ -304,8 +304,8 @@ class DecodedPicture:
 
 
 def deinterlace(
-    items: Iterable[av.VideoFrame | Gap],  # frames in presentation order, and gaps
-) -> Iterator[tuple[av.VideoFrame, bool] | Gap]:
+    items: Iterable[av.VideoFrame | LostPacket],  # frames in presentation order, and gaps
+) -> Iterator[tuple[av.VideoFrame, bool] | LostPacket]:
     """Yields each frame deinterlaced and whether it was interlaced; gaps keep their place."""
     deinterlacer: _Deinterlacer | None = None
     for item in items:
@@ -318,7 +318,7 @@ def deinterlace(
         if deinterlacer is not None:
             yield from deinterlacer.put(item)
         else:
-            yield item if isinstance(item, Gap) else (item, False)
+            yield item if isinstance(item, LostPacket) else (item, False)
     if deinterlacer is not None:
         yield from deinterlacer.put(None)
 
@@ -328,7 +328,7 @@ class _Deinterlacer:
 
     def __init__(self, first: av.VideoFrame) -> None:
         self.size = (first.width, first.height)
-        self._waiting: deque[av.VideoFrame | Gap] = deque()
+        self._waiting: deque[av.VideoFrame | LostPacket] = deque()
         self._graph = Graph()
         source = self._graph.add("buffer", ":".join((
             f"video_size={first.width}x{first.height}", f"pix_fmt={first.format.name}",
@@ -337,15 +337,17 @@ class _Deinterlacer:
         bwdif = self._graph.add("bwdif", BWDIF)
         self._graph.link_nodes(source, bwdif, self._graph.add("buffersink")).configure()
 
-    def put(self, item: av.VideoFrame | Gap | None) -> Iterator[tuple[av.VideoFrame, bool] | Gap]:
+    def put(
+        self, item: av.VideoFrame | LostPacket | None
+    ) -> Iterator[tuple[av.VideoFrame, bool] | LostPacket]:
         """Yields the items that are ready after the next one; None ends the frames."""
         if item is not None:
             self._waiting.append(item)
-        if not isinstance(item, Gap):
+        if not isinstance(item, LostPacket):
             self._graph.vpush(item)
         while self._waiting:
             oldest = self._waiting[0]
-            if isinstance(oldest, Gap):
+            if isinstance(oldest, LostPacket):
                 yield oldest
             else:
                 try:

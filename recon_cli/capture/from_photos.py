@@ -18,14 +18,19 @@ from numpy.typing import NDArray
 from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.dng_corrections import describe_corrections, read_corrections
-from recon_cli.capture.foreign import find_foreign, find_lists
 from recon_cli.capture.frame_selection import FrameCandidate, Reason
 from recon_cli.capture.from_video import judge, report_reduced, report_short
 from recon_cli.capture.images import WHITE, Photo, describe_white, find_white, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
+from recon_cli.capture.known_files import find_foreign, find_lists
 from recon_cli.capture.lens_border import hide_border
-from recon_cli.capture.mask_files import mask_folders
-from recon_cli.capture.masks import FolderMasks, find_masks, photo_mask, write_mask
+from recon_cli.capture.masks import (
+    FolderMasks,
+    find_masks,
+    mask_folders,
+    photo_mask,
+    write_mask,
+)
 from recon_cli.capture.panorama_masks import hide_carried
 from recon_cli.capture.panoramas import fill_sphere
 from recon_cli.capture.photo_sequence import (

@@ -1,27 +1,34 @@
 """Masks of photos: from a folder of masks, or from the photo's own transparency.
 
 White counts, black is ignored. Masks lie in masks/ inside the given folder, or inside its subfolder
-that holds the photos. A mask is named after its photo, with .png or another picture's suffix in
-place of the photo's or, as for COLMAP, appended to it; RealityScan's names are known, too. Masks
-beside the given folder are not used.
+that holds the photos. The mask of images/a/1.jpg is masks/a/1.jpg.png as COLMAP names it,
+masks/a/1.png, or masks/a/1.jpg; any picture's suffix will do. Without subfolders of that name it
+may be masks/1.png, if no other image is called so. RealityScan's layers are folders called .mask,
+or files like 1.jpg.mask.png beside the image. Masks beside the given folder are not used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.images import Photo, read_alpha, read_rgb
-from recon_cli.capture.mask_files import mask_folders, match_masks
+from recon_cli.capture.images import PHOTO_SUFFIXES, RAW_SUFFIXES, Photo, read_alpha, read_rgb
 from recon_cli.errors import InputError
 from recon_cli.workspace import atomic
 
 HALF = 128  # from this value on a pixel is white, or opaque
+MASK_FOLDERS = ("masks", "mask", ".mask")
+_LAYER = ".mask"  # before the suffix of a mask
+_SUFFIXES = PHOTO_SUFFIXES - RAW_SUFFIXES - {".jxl"}
+Key = TypeVar("Key")
 
 
 @dataclass(frozen=True)
@@ -31,6 +38,45 @@ class FolderMasks:
     by_photo: dict[str, Path]  # by the photo's file name
     unused: tuple[str, ...]  # file names of masks without a photo
     outside: Path | None = None  # a folder of masks beside the given one
+
+
+def is_mask_file(path: Path) -> bool:
+    """Returns whether a picture beside others is called the mask of one."""
+    return path.suffix.lower() in _SUFFIXES and path.stem.lower().endswith(_LAYER)
+
+
+def mask_folders(folder: Path) -> list[Path]:
+    """Returns the folders of masks in a folder, and itself if masks lie beside its images."""
+    with suppress(OSError):
+        entries = sorted(folder.iterdir())
+        return [*[folder] * any(map(is_mask_file, entries)), *(
+            path for path in entries if path.name.lower() in MASK_FOLDERS and path.is_dir())]
+    return []
+
+
+def match_masks(
+    folder: Path, images: Mapping[Key, PurePosixPath]
+) -> tuple[dict[Key, Path], list[str]]:
+    """Returns the masks of images, given by their relative paths, and the names of other masks."""
+    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))
+             if path.suffix.lower() in _SUFFIXES and path.name[0] != "." and path.is_file()}
+    if folder.name.lower() not in MASK_FOLDERS and any(map(is_mask_file, files.values())):
+        files = {name: path for name, path in files.items() if is_mask_file(path)}
+    plain: dict[str, Path] = {}  # without the last suffix
+    for name, path in reversed(files.items()):
+        plain[str(PurePosixPath(name).with_suffix("")).lower().removesuffix(_LAYER)] = path
+    alone = Counter(str(image.with_suffix("").name).lower() for image in images.values())
+    masks: dict[Key, Path] = {}
+    for key, image in images.items():
+        stem = str(image.with_suffix(""))
+        names = [str(image), stem]
+        if len(image.parts) > 1 and alone[PurePosixPath(stem).name.lower()] == 1:
+            names += [image.name, PurePosixPath(stem).name]
+        mask = next((plain[name.lower()] for name in names if name.lower() in plain), None)
+        if mask is not None:
+            masks[key] = mask
+    used = set(masks.values())
+    return masks, [name for name, path in files.items() if path not in used]
 
 
 def find_masks(given: Path, home: Path, photos: Sequence[Photo]) -> FolderMasks:

@@ -35,12 +35,11 @@ _SEAM, _OPPOSITE, _POLE = 3.0, 3.0, 0.5
 # Wider pictures have no pole: at 2.2, 3 and 4:1 74 to 100 of 100 panoramas pass without it, and at
 # most 3 of 100 photos of seven captures.
 _LEAST, _SHARE = 3, 0.5  # of the checked pictures must pass where no metadata says it
-_NAMED = 4
 _ASPECT = 0.02  # of an asked-for panorama, which cameras crop by some pixels
 
 
 @dataclass(frozen=True)
-class Projection:
+class ChosenPhotos:
     """The photos of a folder that are used, all of one projection."""
 
     photos: tuple[Photo, ...]
@@ -48,13 +47,13 @@ class Projection:
     notices: tuple[str, ...] = ()
 
 
-def choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Projection:
+def choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> ChosenPhotos:
     """Returns the panoramas of a folder, or its ordinary photos; `camera` is that of IngestConfig.
 
     InputError where too few of either are left, or a picture cannot be what was asked for.
     """
     if camera == "perspective":
-        return Projection(tuple(photos), panoramas=False)
+        return ChosenPhotos(tuple(photos), panoramas=False)
     single, notices = _drop_double(folder, photos)
     chosen = _choose_projection(folder, single, camera)
     return replace(chosen, notices=(*notices, *chosen.notices))
@@ -81,7 +80,7 @@ def _drop_double(folder: str, photos: Sequence[Photo]) -> tuple[list[Photo], lis
                 f"{doubles[0].name}.",
                 hint=f"{advice} --camera perspective uses them as ordinary photos.")
         if doubles:
-            names = list_names([photo.name for photo in doubles], _NAMED)
+            names = list_names([photo.name for photo in doubles])
             notices.append(f"{len(doubles)} {kind} are left out: {names}. {advice}")
     return singles, notices
 
@@ -101,7 +100,7 @@ def _find_double(
             for photo in alike]
 
 
-def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Projection:
+def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> ChosenPhotos:
     if camera == "equirectangular":
         odd = [photo for photo in photos if photo.area is None
                and abs(photo.width / photo.height / 2 - 1) > _ASPECT]
@@ -110,7 +109,7 @@ def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Pro
                 f"{len(odd)} of {len(photos)} pictures in {folder} are not twice as wide as high, "
                 f"as panoramas are, such as {odd[0].name} ({odd[0].width}x{odd[0].height}).",
                 hint="Take them out of the folder, or leave --camera equirectangular out.")
-        return Projection(tuple(photos), panoramas=True)
+        return ChosenPhotos(tuple(photos), panoramas=True)
     found = find_panoramas(photos)
     round_about = [photo for photo in found if photo.area or not photo.panorama]
     bands = find_bands(photos)
@@ -118,11 +117,11 @@ def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Pro
     others = [photo for photo in photos if photo not in found]
     if len(round_about) >= MIN_FRAMES and len(round_about) > len(others):
         left_out = [photo.name for photo in photos if photo not in round_about]
-        return Projection(tuple(round_about), True, (
+        return ChosenPhotos(tuple(round_about), True, (
             f"{len(round_about)} pictures are used as 360-degree panoramas (equirectangular); "
             "--camera perspective uses them as ordinary photos.",
             *([f"{len(left_out)} pictures are left out, because they are not panoramas as the "
-               f"others are: {list_names(left_out, _NAMED)}."] if left_out else [])))
+               f"others are: {list_names(left_out)}."] if left_out else [])))
     if found and len(others) < MIN_FRAMES:
         raise InputError(
             f"{len(found)} of the {len(photos)} pictures in {folder} are panoramas, such as "
@@ -133,11 +132,11 @@ def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> Pro
             "give the folder of ordinary photos; --camera perspective takes these for such.")
     if found:
         names = [photo.name for photo in found]
-        return Projection(tuple(others), False, (
+        return ChosenPhotos(tuple(others), False, (
             f"{len(names)} panoramas are left out, because they are not pictures of ordinary "
-            f"lenses as the others are: {list_names(names, _NAMED)}. To use them, give them in a "
+            f"lenses as the others are: {list_names(names)}. To use them, give them in a "
             "folder of their own.",))
-    return Projection(tuple(others), panoramas=False)
+    return ChosenPhotos(tuple(others), panoramas=False)
 
 
 def fill_sphere(

@@ -1,7 +1,7 @@
 """Which pictures below a folder are the photos of a capture, and the other files there.
 
 All pictures below the folder are photos, but for masks, depth and the like, reduced copies, and
-the pictures that `capture.foreign` lists. Those left out are named, with the command to type.
+the pictures that `capture.known_files` lists. Those left out are named, with the command to type.
 """
 
 from __future__ import annotations
@@ -13,12 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from recon_cli.capture.archives import is_archive
-from recon_cli.capture.foreign import Found, find_foreign
 from recon_cli.capture.images import PHOTO_SUFFIXES, inspect_photo
-from recon_cli.capture.mask_files import FOLDERS as MASK_FOLDERS
-from recon_cli.capture.mask_files import is_mask_file
-from recon_cli.capture.picture_names import picture_kind
+from recon_cli.capture.known_files import Found, find_foreign, is_archive, picture_kind
+from recon_cli.capture.masks import MASK_FOLDERS, is_mask_file
 from recon_cli.errors import InputError, list_names
 from recon_cli.workspace.layout import Workspace
 
@@ -32,7 +29,6 @@ _PICTURE_FOLDERS = frozenset({
     "rgb", "rgbd"})
 _SAME_NAMES = 0.5  # a subfolder of which more pictures are called like those above holds copies
 _VERSIONS = "other versions of these photos"
-_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,7 @@ def _describe_home(folder: Path, home: Path, walk: _Walk) -> Iterator[str]:
     deeper = [place for place in walk.folders if place != home]
     if deeper:
         count = sum(len(walk.folders[place]) for place in deeper)
-        names = list_names([f"{_relative(place, home)}/" for place in sorted(deeper)], _NAMED)
+        names = list_names([f"{_relative(place, home)}/" for place in sorted(deeper)])
         yield (f"{count} photos in subfolders are used too: {names}. To use only some, give their "
                f"folders, or files such as {shlex.quote(str(home))}/*.jpg.")
 
@@ -153,17 +149,17 @@ def _describe_media(folders: Sequence[Path]) -> Iterator[str]:
     files = [path for folder in folders for path in _files(folder)]
     videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
     if videos:
-        names = list_names([path.name for path in videos], _NAMED)
+        names = list_names([path.name for path in videos])
         yield (f"Not used beside photos are videos: {names}. recon ingest "
                f"{shlex.quote(str(folders[0]))} {shlex.quote(str(videos[0]))} uses "
                f"{'both' if len(videos) == 1 else 'the first, too'}.")
     arrays = [path.name for path in files if path.suffix.lower() in (".exr", ".pfm")]
     if arrays:
         yield (f"Not used are {len(arrays)} pictures of depth or high range: "
-               f"{list_names(arrays, _NAMED)}.")
+               f"{list_names(arrays)}.")
     archives = [path.name for path in files if is_archive(path)]
     if archives:
-        yield (f"Not used are archives: {list_names(archives, _NAMED)}. Unpack them if they hold "
+        yield (f"Not used are archives: {list_names(archives)}. Unpack them if they hold "
                "photos of the scene.")
 
 

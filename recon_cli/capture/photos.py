@@ -12,9 +12,9 @@ from pathlib import Path, PurePosixPath
 from recon_cli.capture.depth_pictures import look_like_depth
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
+from recon_cli.capture.known_files import picture_kind
 from recon_cli.capture.panoramas import choose_projection
 from recon_cli.capture.photo_tree import find_videos
-from recon_cli.capture.picture_names import picture_kind
 from recon_cli.errors import InputError, format_count, list_names
 from recon_cli.io.views import evenly_spread
 
@@ -22,7 +22,7 @@ SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 _COLOURED = frozenset({"RGB", "RGBA", "RGBX", "P", "PA", "CMYK", "YCbCr", "LAB", "HSV"})
 _DEPTH = "depth maps"
 _NEVER = (_DEPTH, "confidence maps")  # of one channel and with such a name, they are never photos
-_NAMED = 4
+_MOST_ADVICES = 4  # on pictures of other kinds
 _LOOKED_AT = 8  # pictures of one channel, evenly spread, that tell what all of them show
 # Focal lengths that agree this well are one setting of the lens: EXIF rounds to a tenth of a mm.
 SAME_FOCAL = 0.01
@@ -75,7 +75,7 @@ def choose_pictures(
     notices += chosen.notices
     notices += [
         f"{photo.name} holds {photo.pictures} pictures, of which only the first is used. "
-        f"{unfold_advice(photo)}" for photo in rest if photo.pictures > 1][:_NAMED]
+        f"{unfold_advice(photo)}" for photo in rest if photo.pictures > 1][:_MOST_ADVICES]
     return PhotoFolder(chosen.photos, found.broken, chosen.panoramas), notices
 
 
@@ -106,7 +106,7 @@ def _drop_depth_and_masks(
         dropped.update(names)
         notices.append(
             f"{len(names)} pictures are {kind} and not photos, by their channels and names; they "
-            f"are not used: {list_names(names, _NAMED)}."
+            f"are not used: {list_names(names)}."
             + " Masks are read from masks/, called like their photos." * (kind == "masks"))
     return [photo for photo in photos if photo.name not in dropped], notices
 
@@ -161,7 +161,7 @@ def _count_hint(folder: Path) -> str:
     if videos:
         named = shlex.quote(str(videos[0]))
         return (f"It holds {format_count(len(videos), 'video')}: "
-                f"{list_names([path.name for path in videos], _NAMED)}. Type `recon ingest "
+                f"{list_names([path.name for path in videos])}. Type `recon ingest "
                 f"{named}`, or give several that show one room.")
     return ("Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, HEIC, "
             "camera RAW).")

@@ -15,7 +15,7 @@ from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from recon_cli.capture import video
-from recon_cli.capture.decoded_picture import DecodedPicture, Gap
+from recon_cli.capture.decoded_picture import DecodedPicture, LostPacket
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.capture.lens_border import BorderMeter
 from recon_cli.capture.static_overlay import OverlayMeter
@@ -133,7 +133,7 @@ def measure_scene(
     sharpness, motion = [], []
     for item in video.decode(
             path, threads=decode_threads(scan, threads), size=scan.size):
-        if not isinstance(item, Gap):
+        if not isinstance(item, LostPacket):
             gray = item.gray()
             sharpness.append(measure_sharpness(gray, scan.overlay))
             motion.append(meter.advance(gray))
@@ -160,7 +160,7 @@ def _scan_once(
     meter, tracker, overlay, border = MotionMeter(), Tracker(), OverlayMeter(), BorderMeter()
     with ThreadPoolExecutor(1) as beside:  # the two halves take about as long
         for item in video.decode(path, threads=threads, size=size):
-            if isinstance(item, Gap):
+            if isinstance(item, LostPacket):
                 if item.other_size is None:
                     gaps.append((len(measures), item.pts))
                 else:

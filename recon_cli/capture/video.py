@@ -1,8 +1,8 @@
 """Video files through PyAV: whether a file is a video, its declared length, its frames in order.
 
-A packet that cannot be decoded is skipped and reported as a `Gap`. Of several videos in one file
-the first is used. `codec_name` and `lacks_index` read the container themselves, for messages about
-files that FFmpeg cannot open.
+A packet that cannot be decoded is skipped and reported as a `LostPacket`. Of several videos in one
+file the first is used. `codec_name` and `lacks_index` read the container themselves, for messages
+about files that FFmpeg cannot open.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from recon_cli.capture.decoded_picture import (
     UNSUPPORTED_MATRICES,
     DecodedPicture,
-    Gap,
+    LostPacket,
     Orientation,
     Packing,
     Tags,
@@ -166,8 +166,8 @@ def _count_frames(container: InputContainer, stream: VideoStream) -> int:
 
 def decode(
     path: Path, *, threads: int, size: tuple[int, int] | None = None
-) -> Iterator[DecodedPicture | Gap]:
-    """Yields every frame of a video in presentation order, and a `Gap` for each lost packet.
+) -> Iterator[DecodedPicture | LostPacket]:
+    """Yields every frame of a video in presentation order, and a `LostPacket` for each lost packet.
 
     The frames of an undamaged video do not depend on `threads`. Frames of several sizes are scaled
     to `size` (as stored, width and height), else to that of the first; those of another shape are
@@ -178,7 +178,7 @@ def decode(
         stream.codec_context.thread_count = threads
         tags: Tags | None = None
         for item in deinterlace(_decode_frames(container, stream)):
-            if isinstance(item, Gap):
+            if isinstance(item, LostPacket):
                 yield item
                 continue
             # Not before the first frame: some cameras signal HLG only within the stream.
@@ -186,7 +186,7 @@ def decode(
             tags = tags or replace(
                 _read_tags(path, stream, frame), size=size or (frame.width, frame.height))
             picture = DecodedPicture(frame, tags, item[1])
-            yield picture if picture.fits else Gap(frame.pts, (frame.width, frame.height))
+            yield picture if picture.fits else LostPacket(frame.pts, (frame.width, frame.height))
 
 
 def _read_tags(path: Path, stream: VideoStream, first: av.VideoFrame) -> Tags:
@@ -259,7 +259,7 @@ def stored_frames(
     for item in decode(path, threads=threads):
         if number is None:
             return
-        if isinstance(item, Gap):
+        if isinstance(item, LostPacket):
             at += not places
             continue
         at = places.get(item.frame.pts, at + 1) if item.frame.pts is not None else at + 1
@@ -287,7 +287,9 @@ def _presentation_times(path: Path) -> list[int]:
     return sorted(time for time in times if time is not None)
 
 
-def _decode_frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame | Gap]:
+def _decode_frames(
+    container: InputContainer, stream: VideoStream
+) -> Iterator[av.VideoFrame | LostPacket]:
     """Yields frames and gaps; continues after errors of demuxer and decoder."""
     for _ in range(MAX_DEMUX_ERRORS):
         try:
@@ -295,10 +297,10 @@ def _decode_frames(container: InputContainer, stream: VideoStream) -> Iterator[a
                 try:
                     yield from packet.decode()
                 except av.error.FFmpegError:
-                    yield Gap(packet.pts)
+                    yield LostPacket(packet.pts)
             return
         except av.error.FFmpegError:
-            yield Gap(None)
+            yield LostPacket(None)
 
 
 def codec_name(path: Path) -> str:

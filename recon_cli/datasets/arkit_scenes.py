@@ -9,21 +9,21 @@ up to a millisecond. (apple/ARKitScenes, DATA.md and tenFpsDataLoader.py.)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon_cli.datasets.app_frames import (
-    PICTURES,
-    Z_UP,
-    LeftOut,
-    quoted,
-    tracked_set,
-)
 from recon_cli.datasets.depth_file import lidar_depth
-from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
+from recon_cli.datasets.frame_files import list_timed
+from recon_cli.datasets.frame_table import (
+    Z_UP,
+    FrameTable,
+    LeftOutError,
+    nearest,
+    read_size,
+)
+from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.datasets.trajectory import Trajectory
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import Lens
@@ -31,7 +31,6 @@ from recon_cli.scene.camera import Lens
 _KINDS = ("wide", "vga_wide", "lowres_wide")  # the largest pictures first
 _TRAJ = "lowres_wide.traj"
 _NEAR = 0.0015  # seconds between files of one frame; they are written to the millisecond
-_HINT = "Download the recording again."
 
 
 def is_arkit_scenes(folder: Path) -> bool:
@@ -53,61 +52,36 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
     """
     home = _home(folder)
     assert home is not None
-    kind = next((kind for kind in _KINDS if _by_time(home / kind) and _by_time(
-        home / f"{kind}_intrinsics", (".pincam",))), _KINDS[-1])
-    images = _by_time(home / kind)
-    inner = _by_time(home / f"{kind}_intrinsics", (".pincam",))
-    depths, levels = _by_time(home / "lowres_depth"), _by_time(home / "confidence")
-    path = _read_trajectory(home / _TRAJ)
-    left_out, listed = LeftOut(), []
-    for time, image in images.items():
-        text = _nearest(inner, time)
-        if text is None:
-            left_out.add(image.name, "without a .pincam of their time")
-            continue
-        lens = _read_lens(text, image, left_out)
-        if lens is None:
-            continue
-        viewmat = path.viewmat(time)
-        if viewmat is None:
-            left_out.add(image.name, "without a pose near in time")
-            continue
-        depth = lidar_depth(_nearest(depths, time), _nearest(levels, time), lens)
-        listed.append(PosedImage(image.name, image, lens, viewmat, depth=depth, time=time))
-    return tracked_set(
-        "arkitscenes", listed, folder, left_out, up=Z_UP, photos=quoted(home / kind),
-        bare=sum(_nearest(images, time) is None for time in inner))
+    for kind in _KINDS:
+        images = list_timed(home / kind)
+        inner = list_timed(home / f"{kind}_intrinsics", (".pincam",))
+        if images and inner:
+            break
+    depths, levels = (list_timed(home / name) for name in ("lowres_depth", "confidence"))
+    trajectory = _read_trajectory(home / _TRAJ)
+    table = FrameTable(folder, pictures=home / kind)
+    for time, path in images.items():
+        with table.frame(path.name):
+            lens = _read_lens(nearest(inner, time, _NEAR), path, table)
+            viewmat = trajectory.viewmat(time)
+            if viewmat is None:
+                raise LeftOutError("without a pose near in time")
+            depth = lidar_depth(nearest(depths, time, _NEAR), nearest(levels, time, _NEAR), lens)
+            table.add(PosedImage(path.name, path, lens, viewmat, depth=depth, time=time))
+    return table.finish_tracked(
+        up=Z_UP, without_picture=sum(nearest(images, time, _NEAR) is None for time in inner))
 
 
-def _by_time(folder: Path, suffixes: tuple[str, ...] = PICTURES) -> dict[float, Path]:
-    """Returns the files that are named <id>_<ts>, in order of time."""
-    if not folder.is_dir():
-        return {}
-    found = {}
-    for path in folder.iterdir():
-        text = path.name[:-len(path.suffix)].rpartition("_")[2]
-        if path.suffix.lower() in suffixes and text.replace(".", "", 1).isdecimal():
-            found[float(text)] = path
-    return dict(sorted(found.items()))
-
-
-def _nearest(files: Mapping[float, Path], time: float) -> Path | None:
-    """Returns the file of a time, to a millisecond."""
-    if time in files:
-        return files[time]
-    near = min(files, key=lambda one: abs(one - time), default=None)
-    return files[near] if near is not None and abs(near - time) <= _NEAR else None
-
-
-def _read_lens(text: Path, image: Path, left_out: LeftOut) -> Lens | None:
+def _read_lens(text: Path | None, image: Path, table: FrameTable) -> Lens:
+    if text is None:
+        raise LeftOutError("without a .pincam of their time")
+    read_size(image)
     try:
         width, height, *inner = map(float, text.read_text(encoding="utf-8").split())
         size = round(width), round(height)
-        image_size(image)
-    except (OSError, ValueError, OverflowError, FormatError):
-        left_out.add(image.name, "whose .pincam or picture cannot be read")
-        return None
-    return left_out.lens(image.name, size, tuple, inner)
+    except (OSError, ValueError, OverflowError) as error:
+        raise LeftOutError("whose .pincam cannot be read") from error
+    return table.lens(size, tuple, inner)
 
 
 def _read_trajectory(path: Path) -> Trajectory:
@@ -122,9 +96,9 @@ def _read_trajectory(path: Path) -> Trajectory:
     try:
         values = np.array(lines, np.float64).reshape(-1, 7)
     except ValueError as error:
-        raise FormatError(f"{path} does not hold 7 numbers a line.", hint=_HINT) from error
+        raise FormatError(f"{path} does not hold 7 numbers a line.") from error
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) < 2:
-        raise InputError(f"{path} holds {len(values)} poses.", hint=_HINT)
+        raise InputError(f"{path} holds {len(values)} poses.", hint="Download it again.")
     turns = Rotation.from_rotvec(values[:, 1:4]).inv()
     return Trajectory(values[:, 0], turns, -turns.apply(values[:, 4:7]))

@@ -10,14 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import LeftOut, quoted
-from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
-from recon_cli.datasets.exported_files import PhotoFiles, solved_set
+from recon_cli.capture.known_files import read_head
+from recon_cli.datasets.exported_files import thin_cloud
+from recon_cli.datasets.file_finder import FileFinder
+from recon_cli.datasets.frame_files import parse_numbers
+from recon_cli.datasets.frame_table import FrameTable, LeftOutError
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import make_lens
@@ -25,7 +27,6 @@ from recon_cli.workspace.atomic import read_text
 
 _MARK = b"# Bundle file"
 _LISTS = ("list.txt", "{stem}.list.txt", "{name}.list.txt", "../list.txt")
-_HINT = "Copy the file again; Bundler's format is that of version 0.3."
 _FLIP = np.diag([1.0, -1.0, -1.0])  # from y up and looking along -z
 
 
@@ -36,12 +37,8 @@ def is_bundler(path: Path) -> bool:
 
 def _find(path: Path) -> Path | None:
     files = [path] if path.is_file() else sorted([*path.glob("*.out"), *path.glob("*/bundle.out")])
-    for file in files:
-        if file.suffix == ".out" and file.is_file():
-            with file.open("rb") as stream:
-                if stream.read(len(_MARK)) == _MARK and _list_file(file) is not None:
-                    return file
-    return None
+    return next((file for file in files if file.suffix == ".out"
+                 and read_head(file, len(_MARK)) == _MARK and _list_file(file) is not None), None)
 
 
 def _list_file(file: Path) -> Path | None:
@@ -66,68 +63,43 @@ def read_bundler(path: Path) -> PosedSet:
         raise FormatError(
             f"{file} has {cameras} cameras, but {list_file.name} names {len(names)} images.",
             hint="Copy the list that belongs to it.")
-    left_out, listed = LeftOut(), []
-    files = PhotoFiles(folder, names, left_out)
+    table = FrameTable(folder)
+    finder = FileFinder(folder, names)
     for name in names:
         (focal, k1, k2), rows, shift = _take(lines, 3, file), [
             _take(lines, 3, file) for _ in range(3)], _take(lines, 3, file)
-        image = None if focal == 0 else files.find(name)
-        if focal == 0:
-            left_out.add(name, "that Bundler did not place")
-        elif image is not None:
-            pose = left_out.pose(image.name, _camera_to_world, rows, shift, opengl=False)
-            if pose is not None:
-                width, height = image_size(image)
-                lens = make_lens("RADIAL", width, height,
-                                 (focal, width / 2, height / 2, k1, k2), f"{file}, {name},")
-                if not k1 and not k2:
-                    lens = make_lens("SIMPLE_PINHOLE", width, height, lens.params[:3], str(file))
-                listed.append(PosedImage(image.name, image, lens, pose))
-    posed = solved_set("bundler", listed, folder, left_out, missing=files.missing,
-                       photos=quoted(folder))
-    cloud, colors = _read_points(lines, points, file)
-    posed = replace(posed, find_up=True)
-    return replace(posed, points=cloud, colors=colors) if len(cloud) else posed
+        with table.frame(PurePosixPath(name).name):
+            if focal == 0:
+                raise LeftOutError("that Bundler did not place")
+            path = finder.find_photo(name)
+            viewmat = table.pose(_camera_to_world, rows, shift)
+            width, height = image_size(path)
+            inner = [focal, width / 2, height / 2, *([k1, k2] if k1 or k2 else [])]
+            lens = make_lens("RADIAL" if k1 or k2 else "SIMPLE_PINHOLE", width, height, inner,
+                             f"{file}, {name},")
+            table.add(PosedImage(path.name, path, lens, viewmat))
+    posed = replace(table.finish(), find_up=True)
+    cloud = [(_take(lines, 3, file), _take(lines, 3, file), next(lines, None))[:2]
+             for _ in range(points)]  # the last of the three lines says who sees it
+    return thin_cloud(posed, cloud)
 
 
 def _read(file: Path) -> str:
     try:
         return read_text(file)
     except (OSError, ValueError) as error:
-        raise FormatError(f"{file} cannot be read: {error}.", hint=_HINT) from error
+        raise FormatError(f"{file} cannot be read: {error}.") from error
 
 
 def _take(lines: Iterator[str], count: int, file: Path) -> list[float]:
     """Returns the numbers of the next line."""
     line = next(lines, None)
     if line is None:
-        raise FormatError(f"{file} is cut short.", hint=_HINT)
-    try:
-        values = list(map(float, line.split()))
-    except ValueError as error:
-        raise FormatError(f"{file} has {line[:40]!r} where {count} numbers belong.",
-                          hint=_HINT) from error
-    if len(values) != count:
-        raise FormatError(f"{file} has {line[:40]!r} where {count} numbers belong.", hint=_HINT)
-    return values
+        raise FormatError(f"{file} is cut short.")
+    return list(parse_numbers(line.split(), str(file), count, finite=False))
 
 
 def _camera_to_world(rows: list[list[float]], shift: list[float]) -> NDArray[np.float64]:
     """Returns [3, 4] with OpenCV's camera axes."""
     rotation, moved = _FLIP @ np.array(rows), _FLIP @ np.array(shift)
     return np.column_stack([rotation.T, -rotation.T @ moved])
-
-
-def _read_points(
-    lines: Iterator[str], count: int, file: Path
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    points, colors = [], []
-    for _ in range(count):
-        points.append(_take(lines, 3, file))
-        colors.append(_take(lines, 3, file))
-        next(lines, None)  # who sees it
-    cloud, rgb = np.array(points).reshape(-1, 3), np.array(colors).reshape(-1, 3)
-    good = np.isfinite(cloud).all(axis=1) & np.isfinite(rgb).all(axis=1)
-    cloud, rgb = cloud[good], rgb[good]
-    rows = thin_points(cloud, MAX_POINTS)
-    return cloud[rows], rgb[rows].clip(0, 255).astype(np.uint8)

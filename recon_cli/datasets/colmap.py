@@ -13,14 +13,9 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.exported_files import read_points
 from recon_cli.datasets.file_finder import FileFinder
-from recon_cli.datasets.posed import (
-    SUFFIXES,
-    PosedImage,
-    PosedSet,
-    find_images,
-    is_file,
-    resolve_inside,
-)
+from recon_cli.datasets.frame_files import list_reduced
+from recon_cli.datasets.frame_table import FrameTable
+from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, is_file, resolve_inside
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, NamedImage, count_images, model_suffix, read_model
 from recon_cli.io.images import decode_file
@@ -118,13 +113,6 @@ def is_colmap(folder: Path) -> bool:
     return _find_model(folder) is not None
 
 
-def lacks_cameras(folder: Path) -> bool:
-    """Returns whether a folder holds images of a COLMAP model, but none of its cameras."""
-    return not is_colmap(folder) and any(
-        (folder / place / f"{part}{suffix}").is_file()
-        for place, _ in _PLACES for part in ("images", "frames") for suffix in (".bin", ".txt"))
-
-
 def read_colmap(folder: Path) -> PosedSet:
     """Returns a COLMAP model with its images; InputError if none exist, FormatError if damaged."""
     place = _find_model(folder)
@@ -135,7 +123,7 @@ def read_colmap(folder: Path) -> PosedSet:
     if place[0] != ".":  # not a model that was given itself
         model_at, model_notices = _choose_model(model_at)
     model = read_model(model_at)
-    candidates = [folder / name for name in image_places] + _list_reduced_folders(folder)
+    candidates = [folder / name for name in image_places] + list_reduced(folder)
     if model.images:
         named, home, paths, notices = _locate_images(model, candidates, folder)
     else:
@@ -143,14 +131,16 @@ def read_colmap(folder: Path) -> PosedSet:
         notices = (f"the model lacks the names of its {len(named)} images; they were taken in the "
                    "order of the files, and their colours agree with it",)
         paths = {name: home / name for name, _, _ in named}
-    listed = [PosedImage(name, paths[name], model.lenses[camera], viewmat)
-              for name, camera, viewmat in sorted(named, key=lambda image: image[0])
-              if name in paths]
-    missing = sorted(name for name, _, _ in named if name not in paths)
-    posed = find_images("colmap", listed, model_at, missing=missing)
+    table = FrameTable(model_at, pictures=home)
+    for name, camera, viewmat in sorted(named, key=lambda image: image[0]):
+        if name in paths:
+            table.add(PosedImage(name, paths[name], model.lenses[camera], viewmat))
+        else:
+            table.missing.append(name)
+    table.notices += [*model_notices, *notices]
+    posed = table.finish()
     if len(model.points):
         posed = replace(posed, points=model.points, colors=model.colors)
-    posed = replace(posed, notices=(*model_notices, *notices, *posed.notices))
     # INRIA's trainer and those after it start from it, and write it of the model's own points.
     file = model_at / "points3D.ply"
     return read_points(posed, file) if is_file(file) else posed
@@ -207,12 +197,6 @@ def _choose_model(model_at: Path) -> tuple[Path, tuple[str, ...]]:
         f"of {len(models)} models that did not connect: {others}; give such a folder to read it",)
 
 
-def _list_reduced_folders(folder: Path) -> list[Path]:
-    """Returns images_2, images_4 and so on, the largest images first."""
-    folders = [path for path in folder.glob("images_*") if path.name[7:].isdecimal()]
-    return sorted(folders, key=lambda path: int(path.name[7:]))
-
-
 def _locate_images(
     model: Model, candidates: Sequence[Path], folder: Path
 ) -> tuple[list[NamedImage], Path, dict[str, Path], tuple[str, ...]]:
@@ -228,13 +212,13 @@ def _locate_images(
     places = [path for path in candidates if path.is_dir()] if place is None else [place]
     for home in places:
         finder = FileFinder(home, names)
-        found = finder.find_all(where)
-        if found:
+        paths = finder.find_all(where)
+        if paths:
             for name in names:  # of another machine is a path from its root, not one with ..
-                if name not in found and not PurePosixPath(name).is_absolute():
+                if name not in paths and not PurePosixPath(name).is_absolute():
                     resolve_inside(folder, name, where)
             reduced = (f"the images are those in {home.name}",) * home.name.startswith("images_")
-            return model.images, home, found, (*reduced, *finder.notices())
+            return model.images, home, paths, (*reduced, *finder.notices())
     for name in names:
         resolve_inside(folder, name, where)
     there = next((path for home in places for path in sorted(home.rglob("*"))

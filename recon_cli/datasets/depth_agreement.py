@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from recon_cli.datasets.posed import PosedImage
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import undistort_pixels
-from recon_cli.io.depth_maps import MOST_NOISE
+from recon_cli.io.depth_maps import MEDIAN, MOST_NOISE
 from recon_cli.scene.camera import Lens
 
 # Units of a stored value, in metres: what cameras and data sets write.
@@ -37,7 +37,6 @@ _LEAST_MOVED, _MOST_MOVED, _MOST_TURNED_DEG = 0.2, 1.0, 40.0
 _GRID = 40  # samples a side of a depth map
 _FEWEST = 100  # samples of a pair that both see
 _LEAST_POINTS = 20  # of a view
-_MEDIAN = 5  # pixels a side of the median that takes a sensor's noise, and leaves edges
 _STEPS, _FINE = 9, np.geomspace(0.8, 1.25, 21)  # of the scales that are tried: 22%, then 2%
 # A scale shows, or is better than another one, if the other's error is this many times its own.
 _SHOWN = 1.5
@@ -53,7 +52,7 @@ _ORDERS: dict[str, Turn] = {
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DepthView:
     """Depth, not all of it 0, and the camera that it is of."""
 
     depth: NDArray[np.float32]  # [h, w] as it is read
@@ -88,7 +87,7 @@ def fit_depth(
     viewmats = [image.viewmat for image in images]
 
     @cache
-    def read(at: int) -> View | None:
+    def read(at: int) -> DepthView | None:
         return _read(images[at])
 
     sources = [_ask_pairs(viewmats, read, _AS_READ),
@@ -145,7 +144,7 @@ def _error(estimates: Sequence[_Estimate], scale: float) -> float:
 
 
 def _find_order(
-    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], View | None], error: float
+    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], DepthView | None], error: float
 ) -> str:
     """Returns the fault of depth whose rows or columns are in another order, empty if none is."""
     if error <= _GOOD:
@@ -158,7 +157,7 @@ def _find_order(
     return ""
 
 
-def compare_views(views: Sequence[View]) -> float:
+def compare_views(views: Sequence[DepthView]) -> float:
     """Returns how far depth from different places is apart, relatively, as a median."""
     viewmats = [view.viewmat for view in views]
     errors = []
@@ -177,7 +176,7 @@ def _spread(count: int) -> list[int]:
 
 
 def _ask_points(
-    points: NDArray[np.float64], views: Iterator[View | None]
+    points: NDArray[np.float64], views: Iterator[DepthView | None]
 ) -> list[_Estimate]:
     """Returns the scale of the depth of each view by points that it sees, most of them."""
     estimates = []
@@ -200,7 +199,7 @@ def _compare_ratios(
 
 
 def _ask_pairs(
-    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], View | None], turn: Turn
+    viewmats: Sequence[NDArray[np.float64]], read: Callable[[int], DepthView | None], turn: Turn
 ) -> list[_Estimate]:
     """Returns the scale by which the depth of an image fits that of another, where it shows.
 
@@ -234,7 +233,7 @@ def _list_partners(
             yield order[(1 << rank) - 1]
 
 
-def _read(image: PosedImage) -> View | None:
+def _read(image: PosedImage) -> DepthView | None:
     """Returns the depth of an image where it is certain; None where it is damaged or empty."""
     assert image.depth is not None
     try:
@@ -246,10 +245,10 @@ def _read(image: PosedImage) -> View | None:
     if not depth.any():
         return None
     lens = image.depth.own_lens(*depth.shape[::-1])
-    return View(cv2.medianBlur(depth, _MEDIAN), lens, image.viewmat)
+    return DepthView(cv2.medianBlur(depth, MEDIAN), lens, image.viewmat)
 
 
-def _fit_pair(one: View, other: View, turn: Turn) -> _Estimate | None:
+def _fit_pair(one: DepthView, other: DepthView, turn: Turn) -> _Estimate | None:
     """Returns the scale that fits a pair best, None if others fit it about as well."""
     moved = float(np.linalg.norm((other.viewmat @ np.linalg.inv(one.viewmat))[:3, 3]))
     scales = moved / float(np.median(one.depth[one.depth > 0])) * np.geomspace(
@@ -267,7 +266,7 @@ def _fit_pair(one: View, other: View, turn: Turn) -> _Estimate | None:
 
 
 def _compare(
-    one: View, other: View, turn: Turn, scales: NDArray[np.float64]
+    one: DepthView, other: DepthView, turn: Turn, scales: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Returns the median relative error [S] of depth that one image predicts for another.
 
@@ -284,16 +283,17 @@ def _compare(
     points = np.column_stack([rays[good] * z[good, None], z[good]])
     motion = other.viewmat @ np.linalg.inv(one.viewmat)
     seen = scales[:, None, None] * (points @ motion[:3, :3].T) + motion[:3, 3]
-    found = _look_up(View(turn(other.depth), other.lens, other.viewmat), seen) * scales[:, None]
+    there = DepthView(turn(other.depth), other.lens, other.viewmat)
+    depths = _look_up(there, seen) * scales[:, None]
     errors = np.full(len(scales), np.inf)
-    for at, (expected, there) in enumerate(zip(seen[..., 2], found, strict=True)):
-        known = there > 0
+    for at, (expected, actual) in enumerate(zip(seen[..., 2], depths, strict=True)):
+        known = actual > 0
         if known.sum() >= max(1, min(_FEWEST, len(rows) // 4)):
-            errors[at] = np.median(np.abs(expected[known] / there[known] - 1))
+            errors[at] = np.median(np.abs(expected[known] / actual[known] - 1))
     return errors
 
 
-def _look_up(view: View, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+def _look_up(view: DepthView, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the depth of a view where its camera sees points [..., 3], 0 where it does not.
 
     Distortion is left out: it moves few pixels to another surface.
@@ -302,9 +302,9 @@ def _look_up(view: View, seen: NDArray[np.float64]) -> NDArray[np.float64]:
     fx, fy, cx, cy = params[:4] if len(params) > 3 else (params[0], *params[:3])
     height, width = view.depth.shape
     with np.errstate(divide="ignore", invalid="ignore"):
-        u = seen[..., 0] / seen[..., 2] * fx + cx
-        v = seen[..., 1] / seen[..., 2] * fy + cy
-        inside = (seen[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    found = np.zeros(inside.shape)
-    found[inside] = view.depth[v[inside].astype(int), u[inside].astype(int)]
-    return found
+        u = points[..., 0] / points[..., 2] * fx + cx
+        v = points[..., 1] / points[..., 2] * fy + cy
+        inside = (points[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    depths = np.zeros(inside.shape)
+    depths[inside] = view.depth[v[inside].astype(int), u[inside].astype(int)]
+    return depths

@@ -1,24 +1,20 @@
-"""What readers of photogrammetry exports share: photos by name, points beside them, far worlds."""
+"""What readers of photogrammetry exports share: points beside photos, far worlds, lenses."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from recon_cli.datasets.app_frames import LeftOut
 from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
-from recon_cli.datasets.file_finder import shared_folders
-from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, find_images
+from recon_cli.datasets.posed import PosedSet
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import Lens, make_lens
 
-_PICTURES = frozenset(suffix.lower() for suffix in SUFFIXES)
 # Beyond this many units from the origin, map coordinates: float32 would round to centimetres.
 _FAR = 1e4
 _MOST_OFF = 0.25  # pixels by which a lens without r^8 may miss one that has it
@@ -27,79 +23,22 @@ _FITS = 3.0  # points of the same world lie within so many times the extent of t
 # hundred points spread over them is this near, as a share of the extent. So many are asked.
 _NEAR, _ASKED = 0.1, 2000
 
-
-class PhotoFiles:
-    """The pictures below a folder by names that may be paths elsewhere, or lack a suffix.
-
-    A name that fits several files, or a file that fits several names, is left out, unless their
-    folders tell them apart.
-    """
-
-    def __init__(self, folder: Path, names: Sequence[str], left_out: LeftOut) -> None:
-        self.missing: list[str] = []  # names that were asked for, and that no file has
-        self._left_out = left_out
-        keys: dict[str, list[Path]] = {}
-        for path in sorted(folder.rglob("*")):
-            if path.suffix.lower() in _PICTURES and path.is_file() and path.name[0] != ".":
-                for key in {path.name.casefold(), f"/{path.stem.casefold()}"}:
-                    keys.setdefault(key, []).append(path)
-        self._fitting = {name: _choose(keys, name) for name in names}
-        self._takers = Counter(
-            self._fitting[name][0] for name in names if len(self._fitting[name]) == 1)
-
-    def find(self, name: str) -> Path | None:
-        """Returns the file of a name; None where there is none or not one alone, and counts it."""
-        fitting = self._fitting[name]
-        if not fitting:
-            self.missing.append(PurePosixPath(name).name)
-        elif len(fitting) > 1 or self._takers[fitting[0]] > 1:
-            self._left_out.add(PurePosixPath(name).name, (
-                "whose photos nothing tells apart: several have one name, and no folder of theirs "
-                "is called as in the list"))
-        else:
-            return fitting[0]
-        return None
+Point = tuple[Sequence[float], Sequence[float]]  # place, and RGB from 0 to 255
 
 
-def _choose(keys: Mapping[str, list[Path]], name: str) -> list[Path]:
-    """Returns the files that fit a name, of several those with the most of its folders."""
-    parts = PureWindowsPath(name).parts
-    last = parts[-1] if parts else ""
-    stem = PurePosixPath(last).stem if PurePosixPath(last).suffix.lower() in _PICTURES else last
-    fitting = keys.get(last.casefold()) or keys.get(f"/{stem.casefold()}", [])
-    shared = [shared_folders(path.parts[:-1], parts[:-1]) for path in fitting]
-    return [path for path, count in zip(fitting, shared, strict=True) if count == max(shared)]
-
-
-def solved_set(
-    layout: str, listed: Sequence[PosedImage], folder: Path, left_out: LeftOut, *, photos: str,
-    missing: Sequence[str] = (),
-) -> PosedSet:
-    """Returns the images of an export, in the unit of its world; InputError if there are none."""
-    if not listed:
-        told = "; ".join(left_out.notices())
-        what = told or (f"{len(missing)} photos that it lists are not there, the first is "
-                        f"{missing[0]}" if missing else "it lists none")
-        raise InputError(
-            f"{folder} has no photo with a pose: {what}.",
-            hint="Put the photos beside the file of the cameras; or give them alone, so that the "
-            f"cameras are found from them: recon ingest {photos}")
-    unique = _unique_names(listed, folder)
-    posed = find_images(layout, unique, folder, missing=list(dict.fromkeys(missing)))
-    return replace(posed, notices=(*left_out.notices(), *posed.notices))
-
-
-def _unique_names(listed: Sequence[PosedImage], folder: Path) -> list[PosedImage]:
-    """Returns the images by their file names, or by their paths where some are called alike."""
-    if len({image.name for image in listed}) == len(listed):
-        return list(listed)
-    return [replace(image, name=image.path.relative_to(folder).as_posix()) for image in listed]
+def thin_cloud(posed: PosedSet, cloud: Sequence[Point]) -> PosedSet:
+    """Returns the set with the points that are finite, some of very many, evenly spread."""
+    values = np.array([[*place, *rgb] for place, rgb in cloud]).reshape(-1, 6)
+    values = values[np.isfinite(values).all(axis=1)]
+    values = values[thin_points(values[:, :3], MAX_POINTS)]
+    if not len(values):
+        return posed
+    return replace(posed, points=values[:, :3], colors=values[:, 3:].clip(0, 255).astype(np.uint8))
 
 
 def shift_far(posed: PosedSet) -> PosedSet:
     """Returns the set with its world moved to its cameras, if it lies as far off as on a map."""
-    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
-    middle = np.round(np.median(centers, axis=0))
+    middle = np.round(np.median(posed.centers, axis=0))
     if np.abs(middle).max() < _FAR:
         return posed
     images = []
@@ -156,7 +95,7 @@ def _fits(points: NDArray[np.float64], posed: PosedSet) -> bool:
     """Returns whether points may be of the world of a set, by its cameras and its own points."""
     if not len(points):
         return False
-    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
+    centers = posed.centers
     extent = max(float(np.ptp(centers, axis=0).max()), _extent(points))
     if not np.linalg.norm(np.median(points - np.median(centers, axis=0), axis=0)) <= _FITS * extent:
         return False
@@ -204,13 +143,13 @@ def _without_last(
     corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
     r = np.linspace(0, corner, 200)
     powers = r[:, None]**np.array([3, 5, 7, 9]) * fx  # pixels along the radius
-    wanted = powers @ radial
-    if not np.isfinite(wanted).all():
+    offsets = powers @ radial
+    if not np.isfinite(offsets).all():
         raise FormatError(f"{where} has coefficients of distortion that are not finite.")
-    found = np.linalg.lstsq(powers[:, :3], wanted, rcond=None)[0]
-    off = float(np.abs(powers[:, :3] @ found - wanted).max())
+    fitted = np.linalg.lstsq(powers[:, :3], offsets, rcond=None)[0]
+    off = float(np.abs(powers[:, :3] @ fitted - offsets).max())
     if off > _MOST_OFF:
         raise FormatError(
             f"{where} has k4 = {radial[3]:g}, a term of r^8 that moves points by up to {off:.1f} "
             "pixels, and cannot be used.", hint="Export undistorted images, or fit without k4.")
-    return np.asarray(found)
+    return np.asarray(fitted)

@@ -13,7 +13,8 @@ from functools import cached_property
 from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from recon_cli.capture.picture_names import picture_kind
+from recon_cli.capture.known_files import picture_kind
+from recon_cli.datasets.frame_table import LeftOutError, MissingPictureError
 from recon_cli.datasets.posed import SUFFIXES, is_file, resolve_inside
 from recon_cli.errors import FormatError
 
@@ -47,17 +48,47 @@ class FileFinder:
             return match
         return path if is_file(path) else self._match(name) or path
 
+    def find_photo(self, name: str) -> Path:
+        """Returns the picture of a name; LeftOutError where there is none or not one alone."""
+        fitting = self._photos[name]
+        if not fitting:
+            raise MissingPictureError
+        if len(fitting) > 1 or self._takers[fitting[0]] > 1:
+            raise LeftOutError(
+                "whose photos nothing tells apart: several have one name, and no folder of theirs "
+                "is called as in the list")
+        return fitting[0]
+
+    @cached_property
+    def _photos(self) -> dict[str, list[Path]]:
+        """The files that fit each name."""
+        photos = {}
+        for name in map(str, self._names):
+            paths = self._fitting(name)
+            with suppress(FormatError):
+                path = with_suffix(resolve_inside(self._folder, name, ""))
+                paths = [path] if is_file(path) else paths
+            photos[name] = [path for path in paths if path.suffix.lower() in _PICTURES]
+        return photos
+
+    @cached_property
+    def _takers(self) -> Counter[Path]:
+        """How many names a file fits."""
+        return Counter(
+            fitting[0] for name in self._names
+            if len(fitting := self._photos[str(name)]) == 1)
+
     def find_all(self, where: str) -> dict[str, Path]:
         """Returns the files of the names in the list that have one, each of one name alone."""
-        found = {}
+        files = {}
         for name in self._names:
             with suppress(FormatError):
                 path = self.find(name, where)
                 if is_file(path):
-                    found[str(name)] = path
-        twice = {path for path, count in Counter(found.values()).items() if count > 1}
+                    files[str(name)] = path
+        twice = {path for path, count in Counter(files.values()).items() if count > 1}
         self._moved = {name: path for name, path in self._moved.items() if path not in twice}
-        return {name: path for name, path in found.items() if path not in twice}
+        return {name: path for name, path in files.items() if path not in twice}
 
     def notices(self) -> list[str]:
         """Returns a notice where files were found by their names alone."""
@@ -88,24 +119,29 @@ class FileFinder:
 
     def _match(self, name: object) -> Path | None:
         """Returns the one file that fits a name best, None if there is none or a tie."""
+        fitting = self._fitting(name)
+        if len(fitting) != 1:
+            return None
+        self._moved[str(name)] = fitting[0]
+        return fitting[0]
+
+    def _fitting(self, name: object) -> list[Path]:
+        """Returns the files that fit a name best, several in a tie."""
         # Windows' rules split at both kinds of slashes.
         wanted = PureWindowsPath(name).parts if isinstance(name, str) else ()
         if not wanted:
-            return None
+            return []
         kind = _kind(wanted)
         last = wanted[-1]
         for keys in ([last, *(last + suffix for suffix in SUFFIXES)], [_folded(last)],
                      [_stem(last), _stem(f"{last}.")]):
             candidates = [parts for key in keys for parts in self._files.get(key, ())
                           if _kind(parts) == kind]
-            shared = [shared_folders(parts[:-1], wanted[:-1]) for parts in candidates]
             if candidates:
-                if shared.count(max(shared)) > 1:
-                    return None
-                path = self._folder.joinpath(*candidates[shared.index(max(shared))])
-                self._moved[str(name)] = path
-                return path
-        return None
+                shared = [_shared_folders(parts[:-1], wanted[:-1]) for parts in candidates]
+                return [self._folder.joinpath(*parts) for parts, count in zip(
+                    candidates, shared, strict=True) if count == max(shared)]
+        return []
 
 
 def with_suffix(path: Path) -> Path:
@@ -131,7 +167,7 @@ def _kind(parts: Sequence[str]) -> str:
     return next((kind for part in parts[:-1] if (kind := picture_kind(part))), "")
 
 
-def shared_folders(folders: Sequence[str], others: Sequence[str]) -> int:
+def _shared_folders(folders: Sequence[str], others: Sequence[str]) -> int:
     """Returns how many folders two paths share at their ends, in any case."""
     pairs = zip(reversed(folders), reversed(others), strict=False)
     return len(list(takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs)))

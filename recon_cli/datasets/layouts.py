@@ -8,20 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path, PurePosixPath
 
-from recon_cli.capture.mask_files import mask_folders, match_masks
+from recon_cli.capture.known_files import refuse_lost_poses
+from recon_cli.capture.masks import mask_folders, match_masks
 from recon_cli.datasets.arkit_scenes import is_arkit_scenes, read_arkit_scenes
 from recon_cli.datasets.bundler import is_bundler, read_bundler
-from recon_cli.datasets.colmap import is_colmap, lacks_cameras, read_colmap
-from recon_cli.datasets.incomplete import find_incomplete
-from recon_cli.datasets.kinect import (
-    find_unposed,
-    is_seven_scenes,
-    is_tum,
-    read_seven_scenes,
-    read_tum,
-)
+from recon_cli.datasets.colmap import is_colmap, read_colmap
+from recon_cli.datasets.kinect import is_seven_scenes, is_tum, read_seven_scenes, read_tum
 from recon_cli.datasets.llff import is_llff, read_llff
 from recon_cli.datasets.metashape import is_metashape, read_metashape
 from recon_cli.datasets.nerfcapture import is_nerfcapture, read_nerfcapture
@@ -32,13 +27,7 @@ from recon_cli.datasets.posed import PosedSet
 from recon_cli.datasets.quest import is_quest, read_quest
 from recon_cli.datasets.reality_scan import is_reality_scan, read_reality_scan
 from recon_cli.datasets.record3d import is_record3d, read_record3d
-from recon_cli.datasets.rgbd import (
-    is_replica,
-    is_scannet,
-    lacks_trajectory,
-    read_replica,
-    read_scannet,
-)
+from recon_cli.datasets.rgbd import is_replica, is_scannet, read_replica, read_scannet
 from recon_cli.datasets.rtabmap import is_rtabmap, read_rtabmap
 from recon_cli.datasets.scanner_app import is_scanner_app, read_scanner_app
 from recon_cli.datasets.split_lists import apply_lists
@@ -57,6 +46,7 @@ class Layout:
     needs: str  # its files, for help texts
     fits: Callable[[Path], bool]  # returns whether a path has the layout
     read: Callable[[Path], PosedSet]  # returns the data set at such a path
+    repair: str = "Copy the data set again, or export it again."  # hint where it is damaged
 
 
 # The first that fits wins: nerfstudio leaves the COLMAP model beside its transforms.json.
@@ -81,7 +71,8 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout("arkitscenes", "a recording of ARKitScenes", "lowres_wide.traj, lowres_wide/ and "
            "lowres_wide_intrinsics/", is_arkit_scenes, read_arkit_scenes),
     Layout("rtabmap", "an export of RTAB-Map", "NAME_rgb/, NAME_calib/ and NAME_camera_poses.txt",
-           is_rtabmap, read_rtabmap),
+           is_rtabmap, read_rtabmap,
+           "Export again: rtabmap-export --images --poses_camera --poses_format 11 NAME.db"),
     Layout("quest", "a recording of a Quest headset (MRUK)", "left_camera_mruk_rgba/, "
            "left_camera_mruk_intrinsics.json and left_camera_mruk_frame_metadata.csv", is_quest,
            read_quest),
@@ -95,21 +86,37 @@ LAYOUTS: tuple[Layout, ...] = (
            "a .csv with name, x, y, alt, heading, pitch, roll and f", is_reality_scan,
            read_reality_scan),
     Layout("metashape", "photos with cameras of Metashape", "an .xml of Export Cameras",
-           is_metashape, read_metashape),
+           is_metashape, read_metashape,
+           "Export the cameras again from Metashape: File > Export > Export Cameras, as .xml."),
     Layout("bundler", "photos with cameras of Bundler", "bundle.out and list.txt", is_bundler,
-           read_bundler),
+           read_bundler, "Copy the file again; Bundler's format is that of version 0.3."),
     Layout("opensfm", "photos with cameras of OpenSfM or OpenDroneMap", "reconstruction.json, or "
            "cameras.json and odm_report/shots.geojson", is_opensfm, read_opensfm),
-    Layout("llff", "an LLFF scene", "poses_bounds.npy and images/", is_llff, read_llff),
+    Layout("llff", "an LLFF scene", "poses_bounds.npy and images/", is_llff, read_llff,
+           "Export it again with LLFF's imgs2poses.py."),
 )
-LAYOUTS += tuple(load_rows("recon.layouts", Layout, [row.name for row in LAYOUTS]))
 PACKED = "record3d"  # the layout of what `packed` unpacks
+
+
+@cache
+def list_layouts() -> tuple[Layout, ...]:
+    """Returns all rows, with those of other packages.
+
+    These are loaded at the first call: their modules import this one.
+    """
+    return (*LAYOUTS, *load_rows("recon.layouts", Layout, [row.name for row in LAYOUTS]))
+
+
+def _find_layout(path: Path) -> Layout | None:
+    return next((row for row in list_layouts() if row.fits(path)), None)
 
 
 def recognise(path: Path) -> str | None:
     """Returns the name of the layout that a path has, None where it has no known one."""
-    found = next((row.name for row in LAYOUTS if row.fits(path)), None)
-    return PACKED if found is None and is_packed(path) else found
+    layout = _find_layout(path)
+    if layout is None:
+        return PACKED if is_packed(path) else None
+    return layout.name
 
 
 def refuse_incomplete(path: Path) -> None:
@@ -118,45 +125,32 @@ def refuse_incomplete(path: Path) -> None:
         raise FormatError(
             f"{path} holds frames and depth maps of a Replica sequence, but no poses.",
             hint=f"Give {path.parent}; or give {path / 'frame*'} to estimate the cameras.")
-    if lacks_cameras(path):
-        lacks, images = "a COLMAP model without cameras.bin or cameras.txt", path / "images"
-    elif lacks_trajectory(path):
-        lacks, images = "Replica frames without traj.txt", path / "results" / "frame*"
-    elif unposed := find_unposed(path):
-        lacks, images = unposed
-    elif incomplete := find_incomplete(path):
-        lacks, pictures = incomplete
-        if not pictures:
-            raise FormatError(f"{path} holds {lacks}.", hint="Copy the capture again, all of it.")
-        images = pictures[0]
-    else:
-        return
-    raise FormatError(
-        f"{path} holds {lacks}.",
-        hint=f"Copy that file too, or give {images} to estimate the cameras.")
+    if recognise(path) is None:
+        refuse_lost_poses(path)
 
 
 def read_posed(path: Path) -> PosedSet:
     """Returns the data set at a path; InputError if unknown or empty, FormatError if damaged."""
-    layout = next((row for row in LAYOUTS if row.fits(path)), None)
+    layout = _find_layout(path)
     if layout is None:
-        known = "; ".join(f"{row.words}: {row.needs}" for row in LAYOUTS)
+        known = "; ".join(f"{row.words}: {row.needs}" for row in list_layouts())
         raise InputError(f"{path} is not a data set with poses.", hint=f"Known are {known}.")
     try:
         folder = path if path.is_dir() else path.parent
-        return _attach_masks(apply_lists(layout.read(path), folder), folder)
+        posed = replace(layout.read(path), layout=layout.name)
+        return _attach_masks(apply_lists(posed, folder), folder)
     except FormatError as error:
         if error.hint:
             raise
         raise FormatError(
-            error.message, hint="Copy the data set again, or export it again.") from error
+            error.message, hint=layout.repair) from error
     except OSError as error:  # a folder where a file belongs, or a file that may not be read
         raise FormatError(f"{path} cannot be read: {error}.") from error
 
 
 def describe(posed: PosedSet) -> str:
     """Returns the layout and content of a data set in words, without the notices."""
-    words = next(row.words for row in LAYOUTS if row.name == posed.layout)
+    words = next(row.words for row in list_layouts() if row.name == posed.layout)
     held_out = sum(image.held_out for image in posed.images)
     depth = sum(image.depth is not None for image in posed.images if not image.held_out)
     parts = [format_count(len(posed.images) - held_out, "frame" if posed.sequence else "image")]
@@ -182,21 +176,21 @@ def _attach_masks(posed: PosedSet, folder: Path) -> PosedSet:
         image.path.parents[len(PurePosixPath(image.name).parts) - above] for image in posed.images
         if image.path.is_relative_to(folder) and len(image.path.relative_to(folder).parts)
         > len(PurePosixPath(image.name).parts) for above in (0, 1))])
-    found: dict[str, Path] = {}
+    masks: dict[str, Path] = {}
     unused: list[str] = []
     for place in dict.fromkeys(place for home in homes for place in mask_folders(home)):
-        masks, left = match_masks(place, bare)
-        found = {**masks, **found}
+        matches, left = match_masks(place, bare)
+        masks = {**matches, **masks}
         unused += [name for name in left if place / name not in listed]
-    images = tuple(replace(image, mask=found[image.name]) if image.name in found else image
+    images = tuple(replace(image, mask=masks[image.name]) if image.name in masks else image
                    for image in posed.images)
     notices = list(posed.notices)
-    if found:
-        notices.append(f"{len(found)} of its images have masks")
+    if masks:
+        notices.append(f"{len(masks)} of its images have masks")
     if unused:
         first = posed.images[0].name
         notices.append(
             f"masks without an image are left out: {list_names(unused)}"
             + f"; that of {first} must be called {first}.png or "
-            f"{PurePosixPath(first).with_suffix('.png')}" * (not found))
+            f"{PurePosixPath(first).with_suffix('.png')}" * (not masks))
     return replace(posed, images=images, notices=tuple(notices))

@@ -13,16 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import LeftOut, quoted
-from recon_cli.datasets.exported_files import solved_set
+from recon_cli.datasets.frame_files import list_reduced
+from recon_cli.datasets.frame_table import FrameTable, LeftOutError
 from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.camera import make_lens
 
 _FILE = "poses_bounds.npy"
-_PLACES = ("images", "input", "rgb", ".")
+_PLACES = ("images", "input", "rgb")
 _NUMBERS = (17, 15)  # with the bounds, and without
-_HINT = "Export it again with LLFF's imgs2poses.py."
 
 
 def is_llff(folder: Path) -> bool:
@@ -45,21 +44,18 @@ def read_llff(folder: Path) -> PosedSet:
             f"{folder / _FILE} has {len(rows)} poses, but {home.name}/ {len(images)} images: "
             "nothing says which belong together.",
             hint="Copy all images of the scene; poses and names have one order.")
-    left_out, listed = LeftOut(), []
-    for at, (row, image) in enumerate(zip(rows, images, strict=True)):
-        where = f"{folder / _FILE}, row {at},"
-        viewmat = left_out.pose(image.name, _pose, row, opengl=False)
-        if viewmat is None:
-            continue
-        height, width, focal = row[:, 4]
-        try:
-            lens = make_lens(
-                "PINHOLE", width, height, (focal, focal, width / 2, height / 2), where)
-        except FormatError:
-            left_out.add(image.name, "whose intrinsics cannot be used")
-            continue
-        listed.append(PosedImage(image.name, image, lens, viewmat))
-    return solved_set("llff", listed, folder, left_out, photos=quoted(home))
+    table = FrameTable(folder, pictures=home)
+    for at, (row, path) in enumerate(zip(rows, images, strict=True)):
+        with table.frame(path.name):
+            viewmat = table.pose(_pose, row)
+            height, width, focal = row[:, 4]
+            try:
+                lens = make_lens("PINHOLE", width, height, (focal, focal, width / 2, height / 2),
+                                 f"{folder / _FILE}, row {at},")
+            except FormatError as error:
+                raise LeftOutError("whose intrinsics cannot be used") from error
+            table.add(PosedImage(path.name, path, lens, viewmat))
+    return table.finish()
 
 
 def _read_rows(path: Path) -> NDArray[np.float64]:
@@ -67,11 +63,10 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
     try:
         values = np.array(np.load(path, mmap_mode="r"))  # refuses a shape that the file lacks
     except (OSError, ValueError, EOFError) as error:
-        raise FormatError(f"{path} cannot be read: {error}.", hint=_HINT) from error
+        raise FormatError(f"{path} cannot be read: {error}.") from error
     if values.ndim != 2 or values.shape[1] not in _NUMBERS or values.dtype.kind not in "fiu":
         raise FormatError(
-            f"{path} holds {values.dtype} of shape {values.shape}; needed are 17 numbers a row.",
-            hint=_HINT)
+            f"{path} holds {values.dtype} of shape {values.shape}; needed are 17 numbers a row.")
     return values[:, :15].astype(np.float64).reshape(-1, 3, 5)
 
 
@@ -83,10 +78,9 @@ def _pose(row: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _choose_images(folder: Path, count: int) -> Path:
     """Returns the folder of the images; with a count, the one that has so many, if there is."""
-    reduced = sorted((path for path in folder.glob("images_*") if path.name[7:].isdecimal()),
-                     key=lambda path: int(path.name[7:]))
-    places = [place for place in (*(folder / name for name in _PLACES[:3]), *reduced, folder)
-              if place.is_dir() and _list_images(place)]
+    places = [place for place in (
+        *(folder / name for name in _PLACES), *list_reduced(folder), folder)
+        if place.is_dir() and _list_images(place)]
     if not places:
         raise InputError(f"{folder} holds {_FILE}, but no images.",
                          hint=f"Put the images into {folder / 'images'}.")

@@ -15,9 +15,9 @@ _WORDS = struct.Struct("<II")
 
 def decompress(data: bytes, size: int) -> bytes:
     """Returns the decoded bytes, `size` of them; ValueError if there are others or damaged ones."""
-    found = decoded_size(data)
-    if found != size:
-        raise ValueError(f"it holds {found} bytes, needed {size}")
+    count = decoded_size(data)
+    if count != size:
+        raise ValueError(f"it holds {count} bytes, needed {size}")
     import lzfse
 
     try:

@@ -9,30 +9,27 @@ nerfstudio's issue 2294.)
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import Z_UP, LeftOut, quoted
-from recon_cli.datasets.exported_files import (
-    PhotoFiles,
-    find_points,
-    radial_lens,
-    shift_far,
-    solved_set,
-)
+from recon_cli.capture.known_files import read_head
+from recon_cli.datasets.exported_files import find_points, radial_lens, shift_far
+from recon_cli.datasets.file_finder import FileFinder
+from recon_cli.datasets.frame_files import parse_numbers
+from recon_cli.datasets.frame_table import Z_UP, FrameTable, LeftOutError
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.atomic import read_text
 
-_HINT = "Export the cameras again from Metashape: File > Export > Export Cameras, as .xml."
-_MARKS = (b"<document", b"<chunk", b"<camera")
+_MARKS = re.compile(rb"(?=.*<document)(?=.*<chunk)(?=.*<(?:sensor|camera))", re.DOTALL)
 _HEAD = 1 << 16  # bytes; sensors come before cameras
 _SKEW = 0.5  # pixels that leaving out b2 may move the border
 # On the earth's surface, from its centre: coordinates whose up is not z.
@@ -47,14 +44,9 @@ def is_metashape(path: Path) -> bool:
 
 
 def _find(path: Path) -> Path | None:
-    for file in [path] if path.is_file() else sorted(path.glob("*.xml")):
-        if file.suffix.lower() == ".xml" and file.is_file():
-            with file.open("rb") as stream:
-                head = stream.read(_HEAD)
-            if all(mark in head for mark in _MARKS[:2]) and (
-                    b"<sensor" in head or _MARKS[2] in head):
-                return file
-    return None
+    files = [path] if path.is_file() else sorted(path.glob("*.xml"))
+    return next((file for file in files if file.suffix.lower() == ".xml"
+                 and _MARKS.match(read_head(file, _HEAD))), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,26 +69,20 @@ def read_metashape(path: Path) -> PosedSet:
         found = _read_worlds(chunk, file)
         cameras += _list_cameras(chunk, at, file, found)
         worlds |= {(at, key): world for key, world in found.items()}
-    left_out, listed, missing = LeftOut(), list[PosedImage](), list[str]()
-    for aligned in _by_component(cameras, worlds, left_out):
-        files = PhotoFiles(folder, [camera.path for camera in aligned], left_out)
-        taken = {image.path for image in listed}
+    table = FrameTable(folder)
+    for aligned in _by_component(cameras, worlds, table):
+        finder = FileFinder(folder, [camera.path for camera in aligned])
+        taken = {image.path for image in table.rows}
         for camera in aligned:
-            image = files.find(camera.path)
-            if image in taken:
-                left_out.add(camera.label, "whose photo a larger chunk or component has, too")
-            elif image is not None:
-                viewmat = left_out.pose(
-                    camera.label, _pose, camera, worlds.get(camera.component), opengl=False)
-                lens = None if viewmat is None else _sensor_lens(camera, left_out)
-                if viewmat is not None and lens is not None:
-                    listed.append(PosedImage(image.name, image, lens, viewmat))
-        missing += files.missing
-    listed.sort(key=lambda image: (image.name, image.path))
+            with table.frame(PurePosixPath(camera.path).name):
+                path = finder.find_photo(camera.path)
+                if path in taken:
+                    raise LeftOutError("whose photo a larger chunk or component has, too")
+                viewmat = table.pose(_pose, camera, worlds.get(camera.component))
+                table.add(PosedImage(path.name, path, _sensor_lens(camera), viewmat))
+    table.rows.sort(key=lambda image: (image.name, image.path))
     scaled = any(world is not None and world.scale != 1 for world in worlds.values())
-    posed = solved_set("metashape", listed, folder, left_out, missing=missing,
-                       photos=quoted(folder))
-    return _finish(posed, folder, scaled)
+    return _finish(table.finish(), folder, scaled)
 
 
 def _list_cameras(
@@ -127,8 +113,7 @@ def _list_cameras(
 
 def _finish(posed: PosedSet, folder: Path, scaled: bool) -> PosedSet:
     """Returns the set with its unit, up and points."""
-    centers = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in posed.images])
-    middle = np.median(centers, axis=0)
+    middle = np.median(posed.centers, axis=0)
     radius = float(np.linalg.norm(middle))
     posed = shift_far(find_points(posed, folder))
     if not scaled:  # in the chunk's own units
@@ -146,9 +131,9 @@ def _read_chunks(file: Path) -> list[ElementTree.Element]:
             raise ValueError("it defines entities")
         chunks = ElementTree.fromstring(text).findall("chunk")
     except (OSError, ValueError, ElementTree.ParseError) as error:
-        raise FormatError(f"{file} cannot be read as XML: {error}.", hint=_HINT) from error
+        raise FormatError(f"{file} cannot be read as XML: {error}.") from error
     if not chunks:
-        raise FormatError(f"{file} holds no chunk.", hint=_HINT)
+        raise FormatError(f"{file} holds no chunk.")
     return chunks
 
 
@@ -160,7 +145,7 @@ def _read_worlds(chunk: ElementTree.Element, file: Path) -> dict[str | None, Sim
 
 
 def _by_component(
-    cameras: Sequence[_Camera], worlds: Mapping[_Component, Similarity | None], left_out: LeftOut
+    cameras: Sequence[_Camera], worlds: Mapping[_Component, Similarity | None], table: FrameTable
 ) -> list[list[_Camera]]:
     """Returns the cameras that are aligned and enabled, those of the largest component first.
 
@@ -169,46 +154,40 @@ def _by_component(
     groups: dict[_Component, list[_Camera]] = {}
     for camera in cameras:
         if not camera.enabled:
-            left_out.add(camera.label, "that Metashape has disabled")
+            table.leave_out(camera.label, "that Metashape has disabled")
         elif camera.transform is None:
-            left_out.add(camera.label, "without a transform: not aligned, or second of a rig")
+            table.leave_out(camera.label, "without a transform: not aligned, or second of a rig")
         else:
             groups.setdefault(camera.component, []).append(camera)
     ordered = sorted(groups.values(), key=len, reverse=True)
     if all(worlds.get(component) for component in groups):
         return ordered
     for camera in (camera for group in ordered[1:] for camera in group):
-        left_out.add(camera.label, "of further components, which nothing places in one world")
+        table.leave_out(camera.label, "of further components, which nothing places in one world")
     return ordered[:1]
 
 
 def _numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
-    try:
-        values = np.array((text or "").split(), np.float64)
-    except ValueError as error:
-        raise FormatError(f"{where} holds something other than numbers.", hint=_HINT) from error
-    if values.size != count or not np.isfinite(values).all():
-        raise FormatError(f"{where} has {values.size} numbers, needed {count}.", hint=_HINT)
-    return values
+    return parse_numbers((text or "").split(), where, count)
 
 
 def _similarity(node: ElementTree.Element, file: Path) -> Similarity | None:
     """Returns what takes a chunk or component to the world, None where it does not say."""
-    found = node.find("transform")
-    if found is None:
+    transform = node.find("transform")
+    if transform is None:
         return None
     where = f"{file}, the transform of {node.tag} {node.get('id', '')},"
-    rotation, shift, scale = (found.findtext(key) for key in ("rotation", "translation", "scale"))
+    rotation, shift, scale = map(transform.findtext, ("rotation", "translation", "scale"))
     matrix = np.eye(3) if rotation is None else _numbers(rotation, 9, where).reshape(3, 3)
     left, _, right = np.linalg.svd(matrix)
     if np.abs(left @ right - matrix).max() > 1e-3:
-        raise FormatError(f"{where} holds no rotation.", hint=_HINT)
+        raise FormatError(f"{where} holds no rotation.")
     try:
         return Similarity(
             1.0 if scale is None else float(_numbers(scale, 1, where)[0]), left @ right,
             np.zeros(3) if shift is None else _numbers(shift, 3, where))
     except ValueError as error:
-        raise FormatError(f"{where} cannot be used: {error}.", hint=_HINT) from error
+        raise FormatError(f"{where} cannot be used: {error}.") from error
 
 
 def _pose(camera: _Camera, world: Similarity | None) -> NDArray[np.float64]:
@@ -221,33 +200,30 @@ def _pose(camera: _Camera, world: Similarity | None) -> NDArray[np.float64]:
     return pose
 
 
-def _sensor_lens(camera: _Camera, left_out: LeftOut) -> Lens | None:
-    """Returns the lens of a sensor, None where COLMAP has none like it."""
+def _sensor_lens(camera: _Camera) -> Lens:
+    """Returns the lens of a sensor; LeftOutError where COLMAP has none like it."""
     if camera.sensor is None:
-        left_out.add(camera.label, "of a sensor that the file lacks")
-        return None
+        raise LeftOutError("of a sensor that the file lacks")
     kind = camera.sensor.get("type", "frame")
     if kind not in ("frame", "fisheye", "equidistant_fisheye"):
-        left_out.add(camera.label, f"of a {kind} sensor, which is not read")
-        return None
+        raise LeftOutError(f"of a {kind} sensor, which is not read")
     try:
         return _make_lens(camera.sensor, kind, camera.where)
     except FormatError as error:
-        left_out.add(camera.label, f"whose intrinsics cannot be used ({error.message})")
-        return None
+        raise LeftOutError(f"whose intrinsics cannot be used ({error.message})") from error
 
 
 def _make_lens(sensor: ElementTree.Element, kind: str, where: str) -> Lens:
     calibrations = sensor.findall("calibration")
-    chosen = next((one for one in calibrations if one.get("class") == "adjusted"),
+    calibration = next((one for one in calibrations if one.get("class") == "adjusted"),
                   calibrations[-1] if calibrations else None)
-    size = chosen.find("resolution") if chosen is not None else None
+    size = calibration.find("resolution") if calibration is not None else None
     size = sensor.find("resolution") if size is None else size
-    if chosen is None or size is None:
+    if calibration is None or size is None:
         raise FormatError(f"{where} has no calibration.")
 
     def number(key: str) -> float:
-        text = chosen.findtext(key)
+        text = calibration.findtext(key)
         return 0.0 if text is None else float(_numbers(text, 1, f"{where} {key}")[0])
 
     try:

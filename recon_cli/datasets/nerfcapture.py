@@ -12,10 +12,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from recon_cli.datasets.app_frames import Y_UP, LeftOut, quoted, refuse_one_pose
+from recon_cli.datasets.frame_table import FrameTable
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.datasets.transforms import read_transforms
-from recon_cli.errors import InputError
 
 _FILE = "transforms.json"
 _MARKS = (b'"depth_path"', b'"integer_depth_scale"', b'"depth_integer_scale"')
@@ -33,30 +32,17 @@ def is_nerfcapture(path: Path) -> bool:
 def read_nerfcapture(path: Path) -> PosedSet:
     """Returns the frames in order of time; errors are those of a transforms.json."""
     posed = read_transforms(path)
-    folder = path if path.is_dir() else path.parent
-    hint = ("Give the pictures alone, so that the cameras are found from them: recon ingest "
-            f"{quoted(posed.images[0].path.parent)}")
-    refuse_one_pose(posed.images, folder, hint)
-    left_out = LeftOut()
-    images = [fitted for image in posed.images if (fitted := _fit(image, left_out)) is not None]
-    if not images:
-        raise InputError(
-            f"{folder} has no frame that can be used: {'; '.join(left_out.notices())}.", hint=hint)
-    return replace(
-        posed, layout="nerfcapture", images=tuple(sorted(images, key=_order)), metric=True,
-        metric_by_depth=False, sequence=True, up=Y_UP, accuracy="tracked",
-        notices=(*left_out.notices(), *posed.notices))
-
-
-def _fit(image: PosedImage, left_out: LeftOut) -> PosedImage | None:
-    """Returns a frame with intrinsics for its size; None where they are of another shape."""
-    if image.lens.model != "PINHOLE":
-        return image
-    lens = left_out.lens(
-        image.name, (image.lens.width, image.lens.height), tuple, image.lens.params)
-    if lens is None:
-        return None
-    return replace(image, lens=lens, depth=image.depth and image.depth.with_lens(lens))
+    table = FrameTable(path if path.is_dir() else path.parent,
+                       pictures=posed.images[0].path.parent)
+    for image in sorted(posed.images, key=_order):
+        with table.frame(image.name):
+            lens = image.lens
+            if lens.model == "PINHOLE":
+                lens = table.lens((lens.width, lens.height), tuple, lens.params)
+            table.add(replace(image, lens=lens))
+    table.notices += posed.notices
+    return replace(table.finish_tracked(), splits=posed.splits, missing=posed.missing,
+                   points=posed.points, colors=posed.colors)
 
 
 def _order(image: PosedImage) -> tuple[float, list[tuple[int, str]]]:

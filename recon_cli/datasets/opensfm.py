@@ -10,17 +10,18 @@ opendm/shots.py.) The scale is that of GPS, of which nothing says how good it is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon_cli.datasets.app_frames import Z_UP, LeftOut, quoted
-from recon_cli.datasets.depth_points import MAX_POINTS, thin_points
-from recon_cli.datasets.exported_files import PhotoFiles, radial_lens, shift_far, solved_set
+from recon_cli.datasets.exported_files import Point, radial_lens, shift_far, thin_cloud
+from recon_cli.datasets.file_finder import FileFinder
+from recon_cli.datasets.frame_table import UNUSABLE, Z_UP, FrameTable, LeftOutError
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens, make_lens
@@ -28,7 +29,6 @@ from recon_cli.workspace.atomic import read_json
 
 _RECONSTRUCTIONS = ("reconstruction.json", "opensfm/reconstruction.json")
 _SHOTS = ("odm_report/shots.geojson", "shots.geojson")
-_HINT = "Copy the results of OpenSfM or OpenDroneMap again."
 _PERSPECTIVE = ("perspective", "simple_radial", "radial", "brown")
 _FISHEYE = ("fisheye", "fisheye_opencv")
 
@@ -59,40 +59,32 @@ def read_opensfm(folder: Path) -> PosedSet:
         path = _find(folder, _SHOTS)
         assert path is not None
         value, notices = {}, []
-        cameras, shots = read_json(folder / "cameras.json", dict, hint=_HINT), _features(path)
-    names = [shot[0] for shot in shots]
-    left_out, listed = LeftOut(), list[PosedImage]()
-    files = PhotoFiles(folder, names, left_out)
+        cameras, shots = read_json(folder / "cameras.json", dict), _features(path)
+    table = FrameTable(folder, pictures=folder / "images")
+    finder = FileFinder(folder, [shot[0] for shot in shots])
     for name, camera, turn, position in shots:
-        image = files.find(name)
-        if image is None:
-            continue
-        viewmat = left_out.pose(name, _pose, turn, position, opengl=False)
-        lens = None if viewmat is None else _lens(cameras, camera, image, left_out)
-        if viewmat is not None and lens is not None:
-            listed.append(PosedImage(image.name, image, lens, viewmat))
-    listed.sort(key=lambda image: image.name)
-    posed = solved_set("opensfm", listed, folder, left_out, missing=files.missing,
-                       photos=quoted(folder / "images"))
-    points, colors = _read_points(value.get("points") or {})
-    posed = replace(posed, up=Z_UP, notices=(*posed.notices, *notices, (
+        with table.frame(PurePosixPath(name).name):
+            path = finder.find_photo(name)
+            viewmat = table.pose(_pose, turn, position)
+            table.add(PosedImage(path.name, path, _lens(cameras, camera, path), viewmat))
+    table.rows.sort(key=lambda image: image.name)
+    table.notices += [*notices, (
         "its scale is that of GPS or arbitrary, so its unit is not taken for a metre; "
-        "--scale-between of recon sfm makes it one")))
-    if len(points):
-        posed = replace(posed, points=points, colors=colors)
-    return shift_far(posed)
+        "--scale-between of recon sfm makes it one")]
+    posed = replace(table.finish(), up=Z_UP)
+    return shift_far(thin_cloud(posed, _list_points(value.get("points") or {})))
 
 
 def _largest(path: Path) -> tuple[dict[str, Any], list[str]]:
     """Returns the reconstruction with the most images, and a notice of the others."""
-    found = [one for one in read_json(path, list, hint=_HINT)
-             if isinstance(one, dict) and isinstance(one.get("shots"), dict)]
-    if not found:
-        raise FormatError(f"{path} holds no reconstruction.", hint=_HINT)
-    best = max(found, key=lambda one: len(one["shots"]))
-    others = sum(len(one["shots"]) for one in found if one is not best)
-    return best, [f"{others} images of {len(found) - 1} other reconstructions, which did not "
-                  "connect, are left out"] * (len(found) > 1)
+    models = [one for one in read_json(path, list)
+              if isinstance(one, dict) and isinstance(one.get("shots"), dict)]
+    if not models:
+        raise FormatError(f"{path} holds no reconstruction.")
+    best = max(models, key=lambda one: len(one["shots"]))
+    others = sum(len(one["shots"]) for one in models if one is not best)
+    return best, [f"{others} images of {len(models) - 1} other reconstructions, which did not "
+                  "connect, are left out"] * (len(models) > 1)
 
 
 def _shots(value: Mapping[str, Any], path: Path) -> list[Shot]:
@@ -104,23 +96,23 @@ def _shots(value: Mapping[str, Any], path: Path) -> list[Shot]:
             rotation = Rotation.from_rotvec(turn).as_matrix()
             shots.append((str(name), str(shot["camera"]), turn, -rotation.T @ moved))
         except (KeyError, TypeError, ValueError) as error:
-            raise FormatError(f"{path}, shot {name}, has no pose.", hint=_HINT) from error
+            raise FormatError(f"{path}, shot {name}, has no pose.") from error
     return shots
 
 
 def _features(path: Path) -> list[Shot]:
     """Returns the shots of OpenDroneMap's report."""
-    value = read_json(path, dict, hint=_HINT)
+    value = read_json(path, dict)
     shots = []
     for feature in value.get("features") or []:
         try:
-            found = feature["properties"]
+            properties = feature["properties"]
             shots.append((
-                str(found["filename"]), str(found.get("camera", "")),
-                [float(one) for one in found["rotation"]],
-                np.array([float(one) for one in found["translation"]])))
+                str(properties["filename"]), str(properties.get("camera", "")),
+                [float(one) for one in properties["rotation"]],
+                np.array([float(one) for one in properties["translation"]])))
         except (KeyError, TypeError, ValueError) as error:
-            raise FormatError(f"{path} has a shot without a pose.", hint=_HINT) from error
+            raise FormatError(f"{path} has a shot without a pose.") from error
     return shots
 
 
@@ -131,9 +123,7 @@ def _pose(turn: list[float], position: NDArray[np.float64]) -> NDArray[np.float6
     return np.column_stack([Rotation.from_rotvec(turn).as_matrix().T, position])
 
 
-def _lens(
-    cameras: Mapping[str, Any], name: str, image: Path, left_out: LeftOut
-) -> Lens | None:
+def _lens(cameras: Mapping[str, Any], name: str, image: Path) -> Lens:
     """Returns the lens of a camera; of the one that there is, if a shot names none."""
     camera = cameras.get(name)
     if camera is None and len(cameras) == 1:
@@ -141,9 +131,8 @@ def _lens(
     try:
         assert isinstance(camera, dict)
         return make_opensfm_lens(camera, image)
-    except (AssertionError, FormatError, KeyError, TypeError, ValueError):
-        left_out.add(image.name, "whose camera is missing or of a kind that is not read")
-        return None
+    except (AssertionError, *UNUSABLE) as error:
+        raise LeftOutError("whose camera is missing or of a kind that is not read") from error
 
 
 def make_opensfm_lens(camera: Mapping[str, Any], image: Path) -> Lens:
@@ -170,15 +159,12 @@ def make_opensfm_lens(camera: Mapping[str, Any], image: Path) -> Lens:
     raise ValueError(f"{kind} is not read")
 
 
-def _read_points(value: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    points, colors = [], []
-    for point in value.values():
-        try:
-            at, color = point["coordinates"], point.get("color") or (128, 128, 128)
-            points.append([float(one) for one in at])
-            colors.append([float(one) for one in color])
-        except (KeyError, TypeError, ValueError):
-            continue
-    cloud, rgb = np.array(points).reshape(-1, 3), np.array(colors).reshape(-1, 3)
-    rows = thin_points(cloud, MAX_POINTS)
-    return cloud[rows], rgb[rows].clip(0, 255).astype(np.uint8)
+def _list_points(points: Mapping[str, Any]) -> list[Point]:
+    """Returns the places and colours of points."""
+    cloud: list[Point] = []
+    for point in points.values():
+        with suppress(*UNUSABLE):
+            x, y, z = map(float, point["coordinates"])
+            red, green, blue = map(float, point.get("color") or (128, 128, 128))
+            cloud.append(((x, y, z), (red, green, blue)))
+    return cloud

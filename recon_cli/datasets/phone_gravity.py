@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import numbers, read_csv
+from recon_cli.datasets.frame_files import numbers, read_csv
 
 _COLUMNS = ("timestamp", "a_x", "a_y", "a_z")
 _FROM_DEVICE = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
@@ -28,7 +28,7 @@ _LEAST_TURN_DEG = 30.0  # between frames; with less, any axes would agree
 
 
 @dataclass(frozen=True, eq=False)
-class Gravity:
+class MeasuredUp:
     """Up by an accelerometer."""
 
     up: NDArray[np.float64]  # [3] unit vector in the world of the poses
@@ -44,7 +44,7 @@ class Gravity:
 def read_gravity(
     path: Path, times: Sequence[float],
     viewmats: NDArray[np.float64],  # [F, 4, 4] world to camera, at those times
-) -> Gravity | None:
+) -> MeasuredUp | None:
     """Returns up by a file of accelerations; None if too few frames have any, or its unit is none.
 
     FormatError if columns are missing.
@@ -79,7 +79,7 @@ def read_gravity(
 def _average(
     down: NDArray[np.float64],  # [F, 3] accelerations in the world
     rotations: NDArray[np.float64],  # [F, 3, 3]
-) -> Gravity | None:
+) -> MeasuredUp | None:
     down = down / np.maximum(np.linalg.norm(down, axis=1, keepdims=True), 1e-12)
     mean = np.median(down, axis=0)
     length = float(np.linalg.norm(mean))
@@ -87,5 +87,5 @@ def _average(
         return None
     angles = np.degrees(np.arccos(np.clip(down @ mean / length, -1, 1)))
     cosines = (np.einsum("nij,ij->n", rotations, rotations[0]) - 1) / 2
-    return Gravity(-mean / length, float(np.median(angles)),
+    return MeasuredUp(-mean / length, float(np.median(angles)),
                    float(np.degrees(np.arccos(np.clip(cosines.min(), -1, 1)))))

@@ -10,20 +10,19 @@ there, though a drift of a degree remains; the others keep a distortion that is 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from recon_cli.datasets.app_frames import (
-    PICTURES,
-    LeftOut,
-    list_numbered,
-    quoted,
-    tracked_set,
-)
 from recon_cli.datasets.depth_file import lidar_depth
-from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
-from recon_cli.errors import FormatError
+from recon_cli.datasets.frame_files import list_numbered
+from recon_cli.datasets.frame_table import (
+    FrameTable,
+    MissingPictureError,
+    read_object,
+    read_size,
+)
+from recon_cli.datasets.posed import PosedImage, PosedSet
 
 # Pixels along the border of undistorted images that may be black, as nerfstudio crops them of
 # pictures of 1024x768; of smaller ones by share.
@@ -47,71 +46,45 @@ def read_polycam(folder: Path) -> PosedSet:
     """Returns the keyframes; InputError if none has an image and a camera."""
     place = _keyframes(folder)
     assert place is not None
-    kind = "corrected_" if all(
-        list_numbered(place / name, suffixes) for name, suffixes in (
-            ("corrected_images", PICTURES), ("corrected_cameras", (".json",)))) else ""
-    images = list_numbered(place / f"{kind}images", PICTURES)
-    cameras = list_numbered(place / f"{kind}cameras", (".json",))
-    depths = list_numbered(place / "depth", (".png",))
-    levels = list_numbered(place / "confidence", (".png",))
-    left_out, listed, missing = LeftOut(), [], []
-    for number, path in images.items():
-        if number not in cameras:
-            left_out.add(path.name, "without a camera")
-    for number, camera in cameras.items():
-        if number not in images:
-            missing.append(f"{camera.stem}.jpg")
-            continue
-        image = _list_keyframe(images[number], camera, left_out)
-        if image is None:
-            continue
-        depth = lidar_depth(depths.get(number), levels.get(number), image.lens, high=_HIGH)
-        listed.append(replace(image, depth=depth, rim=_rim(image) if kind else 0))
-    posed = tracked_set(
-        "polycam", listed, folder, left_out, missing=missing,
-        photos=quoted(place / f"{kind}images"))
-    if kind:
-        return posed
-    return replace(posed, notices=(*posed.notices, (
-        "it has no corrected cameras (loop closure was off, or the capture too long): the poses "
-        "drift, and the lens distortion is written nowhere")))
+    for kind in ("corrected_", ""):
+        images = list_numbered(place / f"{kind}images")
+        cameras = list_numbered(place / f"{kind}cameras", (".json",))
+        if images and cameras:
+            break
+    depths, levels = (list_numbered(place / name, (".png",)) for name in ("depth", "confidence"))
+    table = FrameTable(folder, pictures=place / f"{kind}images", opengl=True)
+    for number in dict.fromkeys([*images, *cameras]):
+        path = images.get(number)
+        with table.frame(f"{cameras[number].stem}.jpg" if path is None else path.name):
+            if path is None:
+                raise MissingPictureError
+            value = read_object(cameras.get(number), "without a camera")
+            size = _size(value, path)
+            viewmat = table.pose(_pose, value)
+            lens = table.lens(size, _intrinsics, value)
+            rim = min(_RIM, math.ceil(_RIM_SHARE * min(size))) if kind else 0
+            table.add(PosedImage(
+                path.name, path, lens, viewmat, time=number / 1e6, rim=rim,
+                depth=lidar_depth(depths.get(number), levels.get(number), lens, high=_HIGH)))
+    if not kind:
+        table.notices.append(
+            "it has no corrected cameras (loop closure was off, or the capture too long): the poses "
+            "drift, and the lens distortion is written nowhere")
+    return table.finish_tracked()
 
 
-def _rim(image: PosedImage) -> int:
-    return min(_RIM, math.ceil(_RIM_SHARE * min(image.lens.width, image.lens.height)))
-
-
-def _list_keyframe(path: Path, camera: Path, left_out: LeftOut) -> PosedImage | None:
-    """Returns an image with its camera, None where one of them cannot be used."""
-    value = left_out.json(camera)
-    if value is None:
-        return None
-    try:
-        size = _size(value, path)
-    except FormatError:
-        left_out.add(path.name, "that cannot be read")
-        return None
-    viewmat = left_out.pose(path.name, _pose, value, opengl=True)
-    if viewmat is None:
-        return None
-    lens = left_out.lens(path.name, size, _intrinsics, value)
-    if lens is None:
-        return None
-    return PosedImage(path.name, path, lens, viewmat, time=int(path.stem) / 1e6)
-
-
-def _pose(value: dict[str, Any]) -> list[list[float]]:
+def _pose(value: Mapping[str, Any]) -> list[list[float]]:
     """Returns camera to world, 3x4."""
     return [[float(value[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
 
 
-def _intrinsics(value: dict[str, Any]) -> list[Any]:
+def _intrinsics(value: Mapping[str, Any]) -> list[Any]:
     return [value[key] for key in ("fx", "fy", "cx", "cy")]
 
 
-def _size(value: dict[str, Any], path: Path) -> tuple[int, int]:
+def _size(value: Mapping[str, Any], path: Path) -> tuple[int, int]:
     """Returns the size that the intrinsics are for; recent exports leave it out."""
     try:
         return int(value["width"]), int(value["height"])
     except (KeyError, TypeError, ValueError, OverflowError):
-        return image_size(path)
+        return read_size(path)

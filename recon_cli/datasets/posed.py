@@ -1,15 +1,10 @@
-"""Data sets with known cameras: the records of their readers, and the files that they list.
-
-A reader lists images with lenses and poses; `find_images` keeps those whose file exists, each with
-a lens of its size, as a `PosedSet`.
-"""
+"""Data sets with known cameras: the records that readers return, and the files that they list."""
 
 from __future__ import annotations
 
 import warnings
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from recon_cli.datasets.depth_file import DepthFile
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace.records import PoseAccuracy
 
@@ -27,14 +22,14 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image whose camera is known; its file need not exist before `find_images`.
+    """An image whose camera is known; its file need not exist before `FrameTable.finish`.
 
     The file is an image; or a video, of which it is one frame; or one that `read` reads.
     """
 
     name: str  # unique within the set
     path: Path
-    lens: Lens  # intrinsics, at any size before `find_images` and at that of the file after it
+    lens: Lens  # intrinsics; after `FrameTable.finish` at the size of the file
     viewmat: NDArray[np.float64]  # [4, 4] float64 world to camera, OpenCV axes
     held_out: bool = False  # the data set itself holds it out for the score
     depth: DepthFile | None = None  # reads its depth, None without depth
@@ -55,7 +50,7 @@ class PosedImage:
 class PosedSet:
     """A data set with poses."""
 
-    layout: str  # the name of one of `layouts.LAYOUTS`
+    layout: str  # the name of one of `layouts.LAYOUTS`, which `layouts.read_posed` gives it
     images: tuple[PosedImage, ...]  # in the order of the data set
     missing: tuple[str, ...] = ()  # names of images that it lists, but whose files do not exist
     metric: bool = False  # its unit is the metre
@@ -78,64 +73,10 @@ class PosedSet:
         """The different intrinsics of the images."""
         return tuple(dict.fromkeys(image.lens for image in self.images))
 
-
-def find_images(
-    layout: str, listed: Sequence[PosedImage], where: Path, *, missing: Sequence[str] = ()
-) -> PosedSet:
-    """Returns the images whose files exist, with lenses scaled to the size of the files.
-
-    Sizes are those of the pixels in the file: EXIF orientation is not applied, as COLMAP does not.
-
-    `missing` are names of further images that the set lists, and `where` is its folder, for
-    messages. InputError if no image exists; FormatError if two have one name, or the sizes of files
-    and lenses differ by more than one common factor.
-    """
-    names = [*(item.name for item in listed), *missing]
-    if duplicates := [name for name, count in Counter(names).items() if count > 1]:
-        raise FormatError(
-            f"{where} lists {len(duplicates)} images more than once, the first is "
-            f"{duplicates[0]}.", hint="Leave one pose for each image.")
-    existing = [item for item in listed if is_file(item.path)]
-    if not existing:
-        first = f" The first is {names[0]}." if names else ""
-        raise InputError(
-            f"{where} lists {len(names)} images, but none of their files is there.{first}",
-            hint="Put the images where the data set says, or give the folder that holds both.")
-    missing = (*(item.name for item in listed if not is_file(item.path)), *missing)
-    sizes = [image_size(item.path) if item.is_picture else (item.lens.width, item.lens.height)
-             for item in existing]
-    factor = _check_sizes(existing, sizes)
-    images = []
-    for item, size in zip(existing, sizes, strict=True):
-        lens = item.lens
-        if size != (lens.width, lens.height):
-            lens = lens.resized(*size)
-        images.append(replace(item, lens=lens, depth=item.depth and item.depth.with_lens(lens)))
-    notices = []
-    if missing:
-        notices.append(f"missing: {len(missing)} of the {len(names)} images that it lists, "
-                       f"the first is {missing[0]}")
-    if factor != 1:
-        notices.append(f"its images are {factor:.4g} times as large as its cameras say, so the "
-                       "intrinsics were scaled")
-    return PosedSet(layout, tuple(images), missing, notices=tuple(notices))
-
-
-def _check_sizes(items: Sequence[PosedImage], sizes: Sequence[tuple[int, int]]) -> float:
-    """Returns by which factor the files are larger than their lenses."""
-    factor = float(np.median([
-        width / item.lens.width for item, (width, _) in zip(items, sizes, strict=True)]))
-    slack = 0 if factor == 1 else 1  # pixels; sizes of reduced images are rounded
-    for item, (width, height) in zip(items, sizes, strict=True):
-        off = max(abs(width - factor * item.lens.width), abs(height - factor * item.lens.height))
-        if off > slack:
-            raise FormatError(
-                f"{item.path} is {width}x{height} pixels, but its camera "
-                f"{item.lens.width}x{item.lens.height}; most images are {factor:.4g} times as "
-                "wide as their cameras, which is not a common factor.",
-                hint="Use the images that the poses were made for, all of them or all reduced "
-                "by one factor; the size is that of the file, before any EXIF rotation.")
-    return factor
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """Where the cameras are, [N, 3]."""
+        return np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in self.images])
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import (
-    LeftOut,
+from recon_cli.datasets.frame_files import (
+    find_number,
     fit_intrinsics,
     numbers,
     pose_from_unity,
     quoted,
     read_csv,
-    tracked_set,
 )
+from recon_cli.datasets.frame_table import FrameTable, LeftOutError
 from recon_cli.datasets.posed import PosedImage, PosedSet, is_file, resolve_inside
 from recon_cli.datasets.quest_depth import depth_of_photo, find_order, list_depth
 from recon_cli.errors import FormatError, InputError, format_count
@@ -36,7 +37,6 @@ _EYES = ("left", "right")
 _OK = ("pose_ok", "get_texture_ok", "get_colors_ok")
 _POSITION, _TURN = "pose_pos_{}", "pose_rot_{}"
 _ASKED = 60  # frames that the order of depth is found from
-_HINT = "Copy the recording from the headset again."
 
 
 def is_quest(folder: Path) -> bool:
@@ -47,76 +47,67 @@ def is_quest(folder: Path) -> bool:
 
 def read_quest(folder: Path) -> PosedSet:
     """Returns the frames of both cameras; InputError if none has an image and a pose."""
-    left_out, listed = LeftOut(), list[PosedImage]()
+    table = FrameTable(folder, pictures=(
+        f"{quoted(folder)}, once its .rgba files are converted to pictures"))
     for eye in _EYES:
         if (folder / f"{eye}_camera_mruk_frame_metadata.csv").is_file():
-            listed += _list_eye(folder, eye, left_out)
+            _add_eye(table, folder, eye)
     # Both cameras of a moment after each other, so that neighbours by name are so in time.
-    listed.sort(key=lambda image: (image.path.stem, image.name))
-    posed = tracked_set(
-        "quest", listed, folder, left_out,
-        photos=f"{quoted(folder)}, once its .rgba files are converted to pictures")
-    return _add_depth(posed, folder)
+    table.rows.sort(key=lambda image: (image.path.stem, image.name))
+    if any(folder.glob("*_depth/*.raw")):
+        _add_depth(table, folder)
+    return table.finish_tracked()
 
 
-def _add_depth(posed: PosedSet, folder: Path) -> PosedSet:
-    """Returns the set with depth, where the order of its rows shows, and notices."""
-    if not any(folder.glob("*_depth/*.raw")):
-        return posed
-    left_out, images = LeftOut(), list(posed.images)
+def _add_depth(table: FrameTable, folder: Path) -> None:
+    """Adds depth, where the order of its rows shows, and a notice of frames without."""
     for eye in _EYES:
-        frames = list_depth(folder, eye, left_out)
+        frames = list_depth(folder, eye, table)
         order = find_order(frames[::max(1, len(frames) // _ASKED)])
         if order is not None:
-            images = [replace(image, depth=depth_of_photo(
+            table.rows = [replace(image, depth=depth_of_photo(
                 frames, order, image.clock_ms, image.lens, image.viewmat))
                 if image.clock_ms is not None and image.name.endswith(f"_{eye}.rgba") else image
-                for image in images]
-    unread = sum(image.depth is None for image in images)
-    return replace(posed, images=tuple(images), notices=(
-        *posed.notices, *left_out.notices(), *([
+                for image in table.rows]
+    unread = sum(image.depth is None for image in table.rows)
+    if unread:
+        table.notices.append(
             f"depth is not read of {format_count(unread, 'frame')}: none is near in time, or the "
-            "order of its rows, which is not documented, does not show in it"] if unread else [])))
+            "order of its rows, which is not documented, does not show in it")
 
 
-def _list_eye(folder: Path, eye: str, left_out: LeftOut) -> list[PosedImage]:
-    """Returns the frames of one camera."""
+def _add_eye(table: FrameTable, folder: Path, eye: str) -> None:
+    """Adds the frames of one camera."""
     home = folder / f"{eye}_camera_mruk_rgba"
-    table = folder / f"{eye}_camera_mruk_frame_metadata.csv"
+    metadata = folder / f"{eye}_camera_mruk_frame_metadata.csv"
     columns = [_POSITION.format(axis) for axis in "xyz"], [_TURN.format(axis) for axis in "xyzw"]
-    rows = read_csv(table, ["file_name", *columns[0], *columns[1]])
+    rows = read_csv(metadata, ["file_name", *columns[0], *columns[1]])
     lens = _read_lens(folder / f"{eye}_camera_mruk_intrinsics.json")
-    listed = []
     for row in rows:
-        label = f"{eye} {row.get('file_name', '?')}"
-        if any(row.get(key, "true").lower() in ("false", "0") for key in _OK):
-            left_out.add(label, "that the headset says failed")
-            continue
-        path = _find_file(home, row.get("file_name", ""), table)
-        if path is None:
-            left_out.add(label, "whose .rgba file is missing")
-            continue
-        own = _own_lens(lens, row)
-        if path.stat().st_size != own.width * own.height * 4:
-            left_out.add(label, f"whose .rgba file does not hold {own.width}x{own.height} pixels")
-            continue
-        viewmat = left_out.pose(label, _pose, row, columns, opengl=False)
-        if viewmat is not None:
-            listed.append(PosedImage(
-                f"{path.stem}_{eye}.rgba", path, own, viewmat, time=_time(row),
-                clock_ms=_number(row, "unix_time_ms"),
+        with table.frame(f"{eye} {row.get('file_name', '?')}"):
+            if any(row.get(key, "true").lower() in ("false", "0") for key in _OK):
+                raise LeftOutError("that the headset says failed")
+            path = _find_file(home, row.get("file_name", ""), metadata)
+            own = _own_lens(lens, row)
+            if path.stat().st_size != own.width * own.height * 4:
+                raise LeftOutError(
+                    f"whose .rgba file does not hold {own.width}x{own.height} pixels")
+            viewmat = table.pose(_pose, row, columns)
+            time = find_number(row, "timestamp_us_realtime")
+            table.add(PosedImage(
+                f"{path.stem}_{eye}.rgba", path, own, viewmat, time=time and time / 1e6,
+                clock_ms=find_number(row, "unix_time_ms"),
                 read=functools.partial(read_rgba, path, own.width, own.height)))
-    return listed
 
 
-def _find_file(home: Path, name: str, table: Path) -> Path | None:
+def _find_file(home: Path, name: str, metadata: Path) -> Path:
     """Returns the file of a row, with or without its suffix."""
-    try:
-        path = resolve_inside(home, Path(name).name, str(table))
-    except FormatError:
-        return None
-    named = path if path.suffix == ".rgba" else path.with_name(f"{path.name}.rgba")
-    return named if is_file(named) else None
+    with suppress(FormatError):
+        path = resolve_inside(home, Path(name).name, str(metadata))
+        named = path if path.suffix == ".rgba" else path.with_name(f"{path.name}.rgba")
+        if is_file(named):
+            return named
+    raise LeftOutError("whose .rgba file is missing")
 
 
 def _pose(row: Mapping[str, str], columns: tuple[list[str], list[str]]) -> NDArray[np.float64]:
@@ -124,19 +115,19 @@ def _pose(row: Mapping[str, str], columns: tuple[list[str], list[str]]) -> NDArr
 
 
 def _read_lens(path: Path) -> Lens:
-    value: Mapping[str, Any] = read_json(path, dict, hint=_HINT)
+    value: Mapping[str, Any] = read_json(path, dict)
     try:
         focal, center, size = value["focalLength"], value["principalPoint"], value["resolution"]
         params = [float(pair[axis]) for pair in (focal, center) for axis in "xy"]
         lens = make_lens("PINHOLE", float(size["width"]), float(size["height"]), params, str(path))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path} lacks focalLength, principalPoint or resolution.", hint=_HINT) from error
+            f"{path} lacks focalLength, principalPoint or resolution.") from error
     _, factor = fit_intrinsics(lens.params, (lens.width, lens.height), str(path))
     if factor != 1:
         raise FormatError(
             f"{path} has the principal point {params[2]:.0f}, {params[3]:.0f}, but the resolution "
-            f"{lens.width}x{lens.height}: they are those of different sizes.", hint=_HINT)
+            f"{lens.width}x{lens.height}: they are those of different sizes.")
     return lens
 
 
@@ -150,20 +141,8 @@ def _own_lens(lens: Lens, row: Mapping[str, str]) -> Lens:
             width, height, lens.width, lens.height):
         raise FormatError(
             f"The intrinsics are for {lens.width}x{lens.height} pixels, but pictures have "
-            f"{width}x{height}.", hint=_HINT)
+            f"{width}x{height}.")
     return lens.resized(width, height)
-
-
-def _time(row: Mapping[str, str]) -> float | None:
-    found = _number(row, "timestamp_us_realtime")
-    return None if found is None else found / 1e6
-
-
-def _number(row: Mapping[str, str], key: str) -> float | None:
-    try:
-        return float(row[key])
-    except (KeyError, ValueError):
-        return None
 
 
 def read_rgba(path: Path, width: int, height: int) -> NDArray[np.uint8]:
@@ -171,7 +150,7 @@ def read_rgba(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error}.", hint=_HINT) from error
+        raise InputError(f"{path} cannot be read: {error}.") from error
     if data.size != width * height * 4:
-        raise InputError(f"{path} does not hold {width}x{height} pixels.", hint=_HINT)
+        raise InputError(f"{path} does not hold {width}x{height} pixels.")
     return np.ascontiguousarray(data.reshape(height, width, 4)[::-1, :, :3])

@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import LeftOut, numbers, pose_from_unity, read_csv
-from recon_cli.datasets.depth_agreement import View, compare_views
+from recon_cli.datasets.depth_agreement import DepthView, compare_views
 from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
+from recon_cli.datasets.frame_files import numbers, pose_from_unity, read_csv
+from recon_cli.datasets.frame_table import UNUSABLE, FrameTable, LeftOutError, nearest
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens, make_lens
 
@@ -86,29 +87,35 @@ class Order:
 _ORDERS = tuple(Order(bottom, swapped) for bottom in (False, True) for swapped in (False, True))
 
 
-def list_depth(folder: Path, eye: str, left_out: LeftOut) -> list[DepthFrame]:
+def list_depth(folder: Path, eye: str, table: FrameTable) -> list[DepthFrame]:
     """Returns the depth frames of one side, in order of time; none where their list is missing."""
-    table = folder / f"{eye}_depth_descriptors.csv"
-    if not table.is_file():
-        return []
+    descriptors = folder / f"{eye}_depth_descriptors.csv"
     frames = []
-    for row in read_csv(table, _COLUMNS):
-        try:
-            time, width, height, near, far = numbers(row, _COLUMNS[:5])
-            tangents = tuple(abs(one) for one in numbers(row, _COLUMNS[-4:]))
+    for row in read_csv(descriptors, _COLUMNS) if descriptors.is_file() else ():
+        with table.frame(f"depth {row.get('timestamp_ms', '?')}"):
+            time, size, planes, tangents = _read_camera(row)
             path = folder / f"{eye}_depth" / f"{int(time)}.raw"
-            size = int(width), int(height)
-            angles = tangents[0] + tangents[1], tangents[2] + tangents[3]
-            if not (min(size) > 0 and max(size) <= _MOST_SIDE and near > 0
-                    and min(angles) > 0 and np.isfinite(angles).all()):
-                raise ValueError("no camera")
-        except (KeyError, ValueError, OverflowError):
-            left_out.add(f"depth {row.get('timestamp_ms', '?')}", "of depth without a camera")
-            continue
-        viewmat = left_out.pose(f"depth {int(time)}", _pose, row, opengl=False)
-        if viewmat is not None and path.is_file():
-            frames.append(DepthFrame(path, time, size, (near, far), tangents, viewmat))
+            viewmat = table.pose(_pose, row)
+            if path.is_file():
+                frames.append(DepthFrame(path, time, size, planes, tangents, viewmat))
     return sorted(frames, key=lambda frame: frame.time_ms)
+
+
+def _read_camera(
+    row: Mapping[str, str]
+) -> tuple[float, tuple[int, int], tuple[float, float], tuple[float, ...]]:
+    """Returns time, size, planes and tangents of a frame of depth."""
+    try:
+        time, width, height, near, far = numbers(row, _COLUMNS[:5])
+        tangents = tuple(abs(one) for one in numbers(row, _COLUMNS[-4:]))
+        size = int(width), int(height)
+        angles = tangents[0] + tangents[1], tangents[2] + tangents[3]
+        if not (min(size) > 0 and max(size) <= _MOST_SIDE and near > 0
+                and min(angles) > 0 and np.isfinite(angles).all() and np.isfinite(time)):
+            raise ValueError("no camera")
+    except UNUSABLE as error:
+        raise LeftOutError("of depth without a camera") from error
+    return time, size, (near, far), tangents
 
 
 def _pose(row: Mapping[str, str]) -> NDArray[np.float64]:
@@ -121,7 +128,7 @@ def find_order(frames: Sequence[DepthFrame]) -> Order | None:
     for order in _ORDERS:
         try:
             errors[order] = compare_views([
-                View(depth, frame.lens(order), frame.viewmat) for frame in frames
+                DepthView(depth, frame.lens(order), frame.viewmat) for frame in frames
                 if (depth := _within(frame.read(order))).any()])
         except FormatError:
             return None
@@ -147,14 +154,14 @@ def depth_of_photo(
     viewmat: NDArray[np.float64],
 ) -> DepthFile | None:
     """Returns the depth that a colour camera sees, from the frame nearest in time if any is."""
-    nearest = min(frames, key=lambda frame: abs(frame.time_ms - time_ms), default=None)
-    if nearest is None or abs(nearest.time_ms - time_ms) > _MOST_APART_MS:
+    frame = nearest({frame.time_ms: frame for frame in reversed(frames)}, time_ms, _MOST_APART_MS)
+    if frame is None:
         return None
-    share = min(1.0, nearest.size[0] / lens.width)
+    share = min(1.0, frame.size[0] / lens.width)
     own = lens.resized(round(share * lens.width), round(share * lens.height))
     return DepthFile(
-        nearest.path, 1.0, lens, own=own, reliable=LIDAR_RANGE,
-        make=functools.partial(_carry, nearest, order, own, viewmat))
+        frame.path, 1.0, lens, own=own, reliable=LIDAR_RANGE,
+        make=functools.partial(_carry, frame, order, own, viewmat))
 
 
 def _carry(

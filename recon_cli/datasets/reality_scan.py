@@ -12,33 +12,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon_cli.datasets.app_frames import (
-    HEAD_LINES,
-    Z_UP,
-    LeftOut,
-    column_names,
-    numbers,
-    quoted,
-    read_csv,
-)
-from recon_cli.datasets.exported_files import (
-    PhotoFiles,
-    find_points,
-    radial_lens,
-    shift_far,
-    solved_set,
-)
+from recon_cli.capture.known_files import read_head
+from recon_cli.datasets.exported_files import find_points, radial_lens, shift_far
+from recon_cli.datasets.file_finder import FileFinder
+from recon_cli.datasets.frame_files import HEAD_LINES, column_names, numbers, read_csv
+from recon_cli.datasets.frame_table import UNUSABLE, Z_UP, FrameTable, LeftOutError
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
-from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+_HEAD = HEAD_LINES * 4096  # bytes
 _FILM = 36.0  # millimetres, of the longer side
 
 
@@ -49,14 +38,9 @@ def is_reality_scan(path: Path) -> bool:
 
 def _find(path: Path) -> Path | None:
     files = [path] if path.is_file() else sorted(path.glob("*.csv"))
-    for file in files:
-        if file.suffix.lower() == ".csv" and file.is_file():
-            with file.open("rb") as stream:
-                head = [stream.readline(4096).decode("utf-8-sig", errors="replace")
-                        for _ in range(HEAD_LINES)]
-            if any(set(column_names(line.split(","))) >= set(_NEEDED) for line in head):
-                return file
-    return None
+    return next((file for file in files if file.suffix.lower() == ".csv" and any(
+        set(column_names(line.split(","))) >= set(_NEEDED) for line in read_head(
+            file, _HEAD).decode("utf-8-sig", errors="replace").splitlines()[:HEAD_LINES])), None)
 
 
 def read_reality_scan(path: Path) -> PosedSet:
@@ -65,27 +49,21 @@ def read_reality_scan(path: Path) -> PosedSet:
     assert file is not None
     folder = file.parent
     rows = [row for row in read_csv(file, _NEEDED) if row.get("name")]
-    left_out, listed = LeftOut(), []
-    files = PhotoFiles(folder, [row["name"] for row in rows], left_out)
+    table = FrameTable(folder, opengl=True)
+    finder = FileFinder(folder, [row["name"] for row in rows])
     for row in rows:
-        image = files.find(row["name"])
-        if image is None:
-            continue
-        viewmat = left_out.pose(image.name, _pose, row, opengl=True)
-        if viewmat is None:
-            continue
-        try:
-            lens = _lens(row, image_size(image), f"{file}, {image.name}")
-        except (FormatError, KeyError, ValueError):
-            left_out.add(image.name, "whose intrinsics cannot be used")
-            continue
-        listed.append(PosedImage(image.name, image, lens, viewmat))
-    posed = solved_set("realityscan", listed, folder, left_out, missing=files.missing,
-                       photos=quoted(folder))
-    posed = replace(posed, up=Z_UP, notices=(*posed.notices, (
+        with table.frame(PurePosixPath(row["name"]).name):
+            path = finder.find_photo(row["name"])
+            viewmat = table.pose(_pose, row)
+            try:
+                lens = _lens(row, image_size(path), f"{file}, {path.name}")
+            except UNUSABLE as error:
+                raise LeftOutError("whose intrinsics cannot be used") from error
+            table.add(PosedImage(path.name, path, lens, viewmat))
+    table.notices.append(
         "its unit is a metre only if the project was scaled, which its file does not say; "
-        "--scale-between of recon sfm makes it one")))
-    return shift_far(find_points(posed, folder))
+        "--scale-between of recon sfm makes it one")
+    return shift_far(find_points(replace(table.finish(), up=Z_UP), folder))
 
 
 def _pose(row: Mapping[str, str]) -> NDArray[np.float64]:

@@ -17,21 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import (
-    PICTURES,
-    LeftOut,
-    list_numbered,
-    pose_from_quat,
-    quoted,
-    tracked_set,
-)
 from recon_cli.datasets.depth_file import LIDAR_RANGE, ConfidenceFile, DepthFile
-from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
+from recon_cli.datasets.frame_files import list_numbered, pose_from_quat
+from recon_cli.datasets.frame_table import FrameTable, LeftOutError, read_size
+from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens
 from recon_cli.workspace.atomic import read_json
-
-_HINT = "Export the recording again from Record3D."
 
 
 def is_record3d(folder: Path) -> bool:
@@ -53,39 +45,27 @@ def read_record3d(folder: Path) -> PosedSet:
 
     InputError if none has a pose; FormatError if the metadata are damaged or lack poses or K.
     """
-    found = _find(folder)
-    assert found is not None
-    place, metadata, name = found
-    value = read_json(metadata, dict, hint=_HINT, finite=False)
-    size = _size(value, "w", "h", metadata)
+    files = _find(folder)
+    assert files is not None
+    place, metadata, name = files
+    value = read_json(metadata, dict, finite=False)
+    size, depth_size = (_size(value, *keys, metadata) for keys in (("w", "h"), ("dw", "dh")))
     poses = _list(value, "poses", metadata)
-    depth_size = _size(value, "dw", "dh", metadata)
     own = value.get("perFrameIntrinsicCoeffs") or []
     times = value.get("frameTimestamps") or []
-    left_out, listed = LeftOut(), []
-    images = list_numbered(place / name, PICTURES)
+    images = list_numbered(place / name)
+    table = FrameTable(folder, pictures=place / name, opengl=True)
     for number, path in images.items():
-        if number >= len(poses):
-            left_out.add(path.name, "beyond the list of poses")
-            continue
-        viewmat = left_out.pose(path.name, _pose, poses[number], opengl=True)
-        if viewmat is None:
-            continue
-        try:
-            own_size = size or image_size(path)
-        except FormatError:
-            left_out.add(path.name, "that cannot be read")
-            continue
-        lens = left_out.lens(path.name, own_size, _intrinsics, value, own, number, metadata)
-        if lens is None:
-            continue
-        listed.append(PosedImage(
-            path.name, path, lens, viewmat, depth=_depth(place, path, lens, depth_size),
-            time=_time(times, number)))
-    posed = tracked_set(
-        "record3d", listed, folder, left_out, up=None, photos=quoted(place / name),
-        bare=len(set(range(len(poses))) - set(images)))
-    return posed
+        with table.frame(path.name):
+            if number >= len(poses):
+                raise LeftOutError("beyond the list of poses")
+            viewmat = table.pose(_pose, poses[number])
+            lens = table.lens(size or read_size(path), _intrinsics, value, own, number, metadata)
+            table.add(PosedImage(
+                path.name, path, lens, viewmat, depth=_depth(place, path, lens, depth_size),
+                time=_time(times, number)))
+    return table.finish_tracked(
+        up=None, without_picture=len(set(range(len(poses))) - set(images)))
 
 
 def _pose(row: Sequence[Any]) -> NDArray[np.float64]:
@@ -102,9 +82,9 @@ def _intrinsics(
         return fx, fy, cx, cy
     k = _list(value, "K", metadata)  # old files have this alone
     if len(k) != 9:
-        raise FormatError(f"{metadata} has {len(k)} numbers as K, needed 9.", hint=_HINT)
+        raise FormatError(f"{metadata} has {len(k)} numbers as K, needed 9.")
     if k[2] and k[5] and not k[6] and not k[7]:
-        raise FormatError(f"{metadata} has K row by row, needed column by column.", hint=_HINT)
+        raise FormatError(f"{metadata} has K row by row, needed column by column.")
     return k[0], k[4], k[6], k[7]
 
 
@@ -117,10 +97,9 @@ def _depth(
         return DepthFile(exr, 1.0, lens, reliable=LIDAR_RANGE)
     if not packed.is_file():
         return None
-    shape = size[::-1] if size else None
     levels = path.with_suffix(".conf")
     return DepthFile(
-        packed, 1.0, lens, reliable=LIDAR_RANGE, shape=shape,
+        packed, 1.0, lens, reliable=LIDAR_RANGE, shape=size and size[::-1],
         confidence=ConfidenceFile(levels) if levels.is_file() else None)
 
 
@@ -133,17 +112,17 @@ def _size(
     for key in (width, height):
         number = value[key]
         if not isinstance(number, (int, float)) or not 1 <= number <= 1 << 16:
-            raise FormatError(f"{where} has {key} = {number!r:.40}; needed are pixels.", hint=_HINT)
+            raise FormatError(f"{where} has {key} = {number!r:.40}; needed are pixels.")
     return int(value[width]), int(value[height])
 
 
 def _list(value: dict[str, Any], key: str, where: Path) -> list[Any]:
-    found = value.get(key)
-    if not isinstance(found, list) or not found:
-        raise FormatError(f"{where} has no list of {key}.", hint=_HINT)
-    return found
+    items = value.get(key)
+    if not isinstance(items, list) or not items:
+        raise FormatError(f"{where} has no list of {key}.")
+    return items
 
 
 def _time(times: Sequence[Any], number: int) -> float | None:
-    found = times[number] if number < len(times) else None
-    return float(found) if isinstance(found, (int, float)) else None
+    time = times[number] if number < len(times) else None
+    return float(time) if isinstance(time, (int, float)) else None

@@ -13,8 +13,6 @@ intrinsic_depth.txt. It unprojects integer pixel indices, so its pixel centres l
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,15 +20,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.app_frames import PICTURES, list_numbered
 from recon_cli.datasets.depth_file import MILLIMETRE, DepthFile
-from recon_cli.datasets.posed import PosedImage, PosedSet, find_images, image_size
+from recon_cli.datasets.frame_files import list_numbered, parse_numbers, read_rows
+from recon_cli.datasets.frame_table import FrameTable, LeftOutError
+from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import lens_from_matrix, viewmat_from_pose
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace.atomic import read_json
 
-_FRAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)")
 _TRAJ, _PARAMS = "traj.txt", "cam_params.json"
 
 
@@ -39,25 +37,18 @@ def is_replica(folder: Path) -> bool:
     return (folder / _TRAJ).is_file() and (folder / "results").is_dir()
 
 
-def lacks_trajectory(folder: Path) -> bool:
-    """Returns whether a folder holds frames with depth as Replica does, but no poses."""
-    results = folder / "results"
-    return not (folder / _TRAJ).is_file() and all(
-        next(results.glob(f"{kind}[0-9]*"), None) for kind in ("frame", "depth"))
-
-
 def read_replica(folder: Path) -> PosedSet:
     """Returns a Replica sequence, its test/ folder held out.
 
     InputError if there are no images; FormatError if a file is missing, damaged or does not fit.
     """
     lens, scale = _read_params(folder)
-    listed = _list_sequence(folder, lens, scale)
+    table = FrameTable(folder, pictures=folder / "results")
+    _add_sequence(table, folder, lens, scale)
     splits = (folder / "test" / "results").is_dir()
     if splits:
-        listed += _list_sequence(folder / "test", lens, scale, held_out=True)
-    return replace(
-        find_images("replica", listed, folder), metric=True, sequence=True, splits=splits)
+        _add_sequence(table, folder / "test", lens, scale, held_out=True)
+    return replace(table.finish(), metric=True, sequence=True, splits=splits)
 
 
 def _read_params(folder: Path) -> tuple[Lens, float]:
@@ -84,28 +75,24 @@ def _read_params(folder: Path) -> tuple[Lens, float]:
     return make_lens("PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5), str(path)), scale
 
 
-def _list_sequence(
-    folder: Path, lens: Lens, scale: float, *, held_out: bool = False
-) -> list[PosedImage]:
-    """Returns the frames of one results/ folder by number."""
-    files = {}
-    for path in (folder / "results").iterdir():
-        if match := _FRAME.fullmatch(path.name):
-            files[int(match[1])] = path
-    rows = _read_rows(folder / _TRAJ)
-    _check_count(folder, sorted(files), len(rows))
+def _add_sequence(
+    table: FrameTable, folder: Path, lens: Lens, scale: float, *, held_out: bool = False
+) -> None:
+    """Adds the frames of one results/ folder by number."""
+    files = list_numbered(folder / "results", pattern="frame([0-9]+)")
+    rows = read_rows(folder / _TRAJ)
+    _check_count(folder, list(files), len(rows))
     prefix = "test_" if held_out else ""
-    digits = next((len(path.stem) - len("frame") for path in files.values()), 6)
-    suffix = next((path.suffix for path in files.values()), ".jpg")
-    listed = []
+    first = next(iter(files.values()))
+    digits, suffix = len(first.stem) - len("frame"), first.suffix
     for number in range(max(files) + 1):
         path = files.get(number, folder / "results" / f"frame{number:0{digits}d}{suffix}")
-        viewmat = viewmat_from_pose(rows[number], f"{folder / _TRAJ}, line {number + 1},")
+        where, words = rows[number]
+        viewmat = viewmat_from_pose(parse_numbers(words, where, 16), where)
         depth = path.with_name(path.stem.replace("frame", "depth") + ".png")
-        listed.append(PosedImage(
+        table.add(PosedImage(
             prefix + path.name, path, lens, viewmat, held_out,
             DepthFile(depth, 1 / scale, lens) if depth.is_file() else None))
-    return listed
 
 
 def _check_count(folder: Path, numbers: list[int], rows: int) -> None:
@@ -123,26 +110,6 @@ def _check_count(folder: Path, numbers: list[int], rows: int) -> None:
             hint="Copy traj.txt again; it has one line for each frame, the first for frame000000.")
 
 
-def _read_rows(path: Path) -> list[NDArray[np.float64]]:
-    """Returns the 16 numbers of each line that is not empty."""
-    if not path.is_file():
-        raise FormatError(
-            f"{path} is missing.", hint="Copy it; it has one line for each frame of results.")
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    return [_parse_numbers(line, f"{path}, line {at},", (16,))
-            for at, line in enumerate(lines, 1) if line.strip()]
-
-
-def _parse_numbers(text: str, where: str, sizes: tuple[int, ...]) -> NDArray[np.float64]:
-    try:
-        numbers = np.array(text.split(), np.float64)
-    except ValueError as error:
-        raise FormatError(f"{where} holds something other than numbers.") from error
-    if numbers.size not in sizes:
-        raise FormatError(f"{where} has {numbers.size} numbers, needed 16 of a 4x4 matrix.")
-    return numbers
-
-
 def is_scannet(folder: Path) -> bool:
     """Returns whether a folder has the layout of ScanNet."""
     return (folder / "color").is_dir() and (folder / "pose").is_dir()
@@ -153,7 +120,7 @@ def read_scannet(folder: Path) -> PosedSet:
 
     InputError if no frame has an image and a pose; FormatError if a file is missing or damaged.
     """
-    colors = list_numbered(folder / "color", PICTURES)
+    colors = list_numbered(folder / "color")
     poses = list_numbered(folder / "pose", (".txt",))
     if not colors or not poses:
         raise InputError(
@@ -162,33 +129,13 @@ def read_scannet(folder: Path) -> PosedSet:
     lens = _read_lens(folder, "color", image_size(next(iter(colors.values()))))
     depths = list_numbered(folder / "depth", (".png",))
     own = _read_lens(folder, "depth", image_size(next(iter(depths.values())))) if depths else None
-    listed, lost = [], 0
+    table = FrameTable(folder, pictures=folder / "color")
     for number, path in colors.items():
-        viewmat = read_pose(poses[number]) if number in poses else None
-        if viewmat is None:
-            lost += 1
-            continue
-        depth = DepthFile(depths[number], MILLIMETRE, lens, own) if number in depths else None
-        listed.append(PosedImage(path.name, path, lens, viewmat, depth=depth))
-    return tracked_sequence("scannet", listed, folder, lost)
-
-
-def tracked_sequence(
-    layout: str, listed: Sequence[PosedImage], folder: Path, lost: int,
-    notices: tuple[str, ...] = (),
-) -> PosedSet:
-    """Returns the frames of a metric sequence that have a pose; `lost` others have none.
-
-    InputError if no frame has an image and a pose.
-    """
-    if not listed:
-        raise InputError(
-            f"{folder} has no frame with a pose: tracking was lost in all {lost}.",
-            hint="Give the color images alone, so that `recon` finds the poses itself.")
-    posed = find_images(layout, listed, folder)
-    if lost:
-        notices += (f"{lost} frames whose tracking was lost have no pose and are left out",)
-    return replace(posed, metric=True, sequence=True, notices=notices + posed.notices)
+        with table.frame(path.name):
+            viewmat = read_pose(poses.get(number))
+            depth = DepthFile(depths[number], MILLIMETRE, lens, own) if number in depths else None
+            table.add(PosedImage(path.name, path, lens, viewmat, depth=depth))
+    return replace(table.finish(), metric=True, sequence=True)
 
 
 def _read_lens(folder: Path, kind: str, size: tuple[int, int]) -> Lens:
@@ -208,15 +155,17 @@ def _read_lens(folder: Path, kind: str, size: tuple[int, int]) -> Lens:
     return lens
 
 
-def read_pose(path: Path) -> NDArray[np.float64] | None:
-    """Returns [4, 4] world to camera, None where tracking was lost."""
-    matrix = read_matrix(path)
-    return viewmat_from_pose(matrix, str(path)) if not np.isinf(matrix).any() else None
+def read_pose(path: Path | None) -> NDArray[np.float64]:
+    """Returns [4, 4] world to camera; LeftOutError where tracking was lost."""
+    matrix = np.array(np.inf) if path is None else read_matrix(path)
+    if np.isinf(matrix).any():
+        raise LeftOutError("whose tracking was lost")
+    return viewmat_from_pose(matrix, str(path))
 
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
     """Returns a 4x4 (or 3x3) matrix of text."""
     text = path.read_text(encoding="utf-8", errors="replace")
-    values = _parse_numbers(text, str(path), (9, 16))
+    values = parse_numbers(text.split(), str(path), 9, 16, finite=False)
     side = 3 if values.size == 9 else 4
     return values.reshape(side, side)

@@ -13,23 +13,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from recon_cli.datasets.app_frames import (
-    PICTURES,
-    Z_UP,
-    LeftOut,
-    fit_intrinsics,
-    pose_from_quat,
-    quoted,
-    tracked_set,
-)
 from recon_cli.datasets.depth_file import lidar_depth
+from recon_cli.datasets.frame_files import PICTURES, fit_intrinsics, pose_from_quat
+from recon_cli.datasets.frame_table import Z_UP, FrameTable, LeftOutError, nearest
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Lens, make_lens
@@ -38,7 +30,6 @@ from recon_cli.workspace.atomic import read_text
 _POSES = re.compile(r"(.+)_camera_poses(?:_(\d+))?\.txt")
 _BASE = re.compile(r"(.+)_poses\.txt")
 _NUMBERS = r"\s*:\s*\[([^\]]*)\]"
-_HINT = "Export again: rtabmap-export --images --poses_camera --poses_format 11 NAME.db"
 _NEAR = 1e-4  # seconds; stamps are written with 6 decimals
 _PLUMB_BOB = (4, 5)  # k1 k2 p1 p2 (k3)
 _RATIONAL = 8  # and k4 k5 k6
@@ -53,18 +44,18 @@ def is_rtabmap(folder: Path) -> bool:
 
 def _find(folder: Path) -> list[tuple[str, str, Path, bool]]:
     """Returns name, suffix of the camera, file of poses, and whether these are the base's."""
-    found = []
+    cameras = []
     files = sorted(folder.glob("*_poses*.txt")) if folder.is_dir() else []
     for path in files:
         match = _POSES.fullmatch(path.name)
         if match and _pictures(folder, match[1]):
-            found.append((match[1], f"_{match[2]}" if match[2] else "", path, False))
-    if not found:
+            cameras.append((match[1], f"_{match[2]}" if match[2] else "", path, False))
+    if not cameras:
         for path in files:
             match = _BASE.fullmatch(path.name)
             if match and _pictures(folder, match[1]) and (folder / f"{match[1]}_calib").is_dir():
-                found.append((match[1], "", path, True))
-    return found
+                cameras.append((match[1], "", path, True))
+    return cameras
 
 
 def _pictures(folder: Path, name: str) -> Path | None:
@@ -77,32 +68,28 @@ def read_rtabmap(folder: Path) -> PosedSet:
 
     InputError if there is none; FormatError if the poses have no time stamps or are damaged.
     """
-    found = _find(folder)
-    left_out, listed, bare = LeftOut(), list[PosedImage](), 0
-    for name, camera, path, base in found[:1] if found[0][3] else found:
-        images, unused = _list_camera(folder, name, camera, path, base, left_out)
-        listed += images
-        bare += unused
-    notices = [f"its confidence has values up to {scale}, which are taken as certain" for scale in
-               {image.depth.confidence.high for image in listed
-                if image.depth and image.depth.confidence}]
-    posed = tracked_set(
-        "rtabmap", listed, folder, left_out, up=Z_UP, bare=bare,
-        photos=quoted(_pictures(folder, found[0][0]) or folder))
-    return replace(posed, notices=(*posed.notices, *notices))
+    cameras = _find(folder)
+    table = FrameTable(folder, pictures=_pictures(folder, cameras[0][0]) or folder)
+    unused = sum(_add_camera(table, folder, name, camera, path, base)
+                 for name, camera, path, base in (cameras[:1] if cameras[0][3] else cameras))
+    table.notices += [
+        f"its confidence has values up to {scale}, which are taken as certain" for scale in {
+            image.depth.confidence.high for image in table.rows
+            if image.depth and image.depth.confidence}]
+    return table.finish_tracked(up=Z_UP, without_picture=unused)
 
 
-def _list_camera(
-    folder: Path, name: str, camera: str, path: Path, base: bool, left_out: LeftOut
-) -> tuple[list[PosedImage], int]:
-    """Returns the images of one camera, and how many poses have none."""
+def _add_camera(
+    table: FrameTable, folder: Path, name: str, camera: str, path: Path, base: bool
+) -> int:
+    """Adds the images of one camera, and returns how many poses have none."""
     place = _pictures(folder, name)
     assert place is not None
-    by_time, by_id = _read_poses(path)
+    count, by_time, by_id = _read_poses(path)
     levels = {file.stem: file for file in sorted((folder / f"{name}_confidence").glob("*.png"))}
     scale = _confidence_scale(list(levels.values()))
     several = camera or next(place.glob("*_0.*"), None)
-    listed, shown = [], set[int]()
+    used = set[int]()
     for image in sorted(place.iterdir(), key=lambda one: _order(one.stem)):
         if image.suffix.lower() not in PICTURES:
             continue
@@ -110,30 +97,22 @@ def _list_camera(
         if several:
             stem, mark, number = stem.rpartition("_")
             if not mark and camera in ("", "_0"):
-                left_out.add(image.name, "that hold several cameras beside each other")
+                table.leave_out(image.name, "that hold several cameras beside each other")
             if f"_{number}" != (camera or "_0"):
                 continue
-        pose = _look_up(stem, by_time, by_id)
-        if pose is None:
-            left_out.add(image.name, f"without a pose in {path.name}")
-            continue
-        shown.add(id(pose))
-        calibration = folder / f"{name}_calib" / f"{image.stem}.yaml"
-        try:
-            lens, local = _read_calibration(calibration)
-        except FormatError:
-            left_out.add(image.name, "without a calibration that can be read")
-            continue
-        viewmat = left_out.pose(
-            image.name, np.matmul, pose, local if base else np.eye(4), opengl=False)
-        if viewmat is None:
-            continue
-        depth = folder / f"{name}_depth" / f"{image.stem}.png"
-        listed.append(PosedImage(
-            image.name, image, lens, viewmat, time=float(stem) if "." in stem else None,
-            depth=lidar_depth(depth if depth.is_file() else None, levels.get(image.stem), lens,
-                              high=scale)))
-    return listed, len(by_time) - len(shown)
+        with table.frame(image.name):
+            pose = _look_up(stem, by_time, by_id)
+            if pose is None:
+                raise LeftOutError(f"without a pose in {path.name}")
+            used.add(id(pose))
+            lens, local = _read_calibration(folder / f"{name}_calib" / f"{image.stem}.yaml")
+            viewmat = table.pose(np.matmul, pose, local if base else np.eye(4))
+            depth = folder / f"{name}_depth" / f"{image.stem}.png"
+            table.add(PosedImage(
+                image.name, image, lens, viewmat, time=float(stem) if "." in stem else None,
+                depth=lidar_depth(depth if depth.is_file() else None, levels.get(image.stem), lens,
+                                  high=scale)))
+    return count - len(used)
 
 
 def _confidence_scale(files: Sequence[Path]) -> int:
@@ -153,17 +132,16 @@ def _order(stem: str) -> tuple[float, str]:
     return (float(number) if number.replace(".", "", 1).isdecimal() else 0.0), stem
 
 
-Poses = list[tuple[float, NDArray[np.float64]]]
+Poses = dict[float, NDArray[np.float64]]
 
 
-def _read_poses(path: Path) -> tuple[Poses, dict[int, NDArray[np.float64]]]:
-    """Returns camera to world by time, in its order, and by id; landmarks are left out."""
+def _read_poses(path: Path) -> tuple[int, Poses, Poses]:
+    """Returns how many poses there are, and camera to world by time and by id; no landmarks."""
     try:
         lines = read_text(path).splitlines()
     except (OSError, ValueError) as error:
-        raise FormatError(f"{path} cannot be read: {error}.", hint=_HINT) from error
-    by_time: Poses = []
-    by_id = {}
+        raise FormatError(f"{path} cannot be read: {error}.") from error
+    count, by_time, by_id = 0, Poses(), Poses()
     rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     for at, row in enumerate(rows):
         if len(row) not in (8, 9):
@@ -171,7 +149,7 @@ def _read_poses(path: Path) -> tuple[Poses, dict[int, NDArray[np.float64]]]:
                 continue
             raise FormatError(
                 f"{path} has {len(row)} words in a line; needed are 8 or 9: the time, x y z, "
-                "qx qy qz qw, and the id.", hint=_HINT)
+                "qx qy qz qw, and the id.")
         values = [_float(word) for word in row]
         if len(row) == 9 and values[8] < 0:  # a landmark
             continue
@@ -179,10 +157,12 @@ def _read_poses(path: Path) -> tuple[Poses, dict[int, NDArray[np.float64]]]:
             pose = pose_from_quat(values[4:8], values[1:4])
         except ValueError:
             pose = np.full((4, 4), np.nan)
-        by_time.append((values[0], pose))
+        count += 1
+        if np.isfinite(values[0]):
+            by_time.setdefault(values[0], pose)
         if len(row) == 9 and np.isfinite(values[8]):
             by_id[int(values[8])] = pose
-    return sorted(by_time, key=lambda one: one[0]), by_id
+    return count, dict(sorted(by_time.items())), by_id
 
 
 def _float(text: str) -> float:
@@ -192,23 +172,22 @@ def _float(text: str) -> float:
         return float("nan")
 
 
-def _look_up(
-    stem: str, by_time: Poses, by_id: dict[int, NDArray[np.float64]]
-) -> NDArray[np.float64] | None:
-    """Returns the pose of a file, by its time, else by its id."""
+def _look_up(stem: str, by_time: Poses, by_id: Poses) -> NDArray[np.float64] | None:
+    """Returns the pose of a file, by its id, else by its time."""
     if stem.isdecimal() and int(stem) in by_id:
         return by_id[int(stem)]
-    time = _float(stem)
-    near = min(by_time, key=lambda one: abs(one[0] - time), default=None)
-    return near[1] if near is not None and abs(near[0] - time) <= _NEAR else None
+    return nearest(by_time, _float(stem), _NEAR)
 
 
 def _read_calibration(path: Path) -> tuple[Lens, NDArray[np.float64]]:
-    """Returns the lens and local_transform of OpenCV's YAML; FormatError if it is none."""
+    """Returns the lens and local_transform of OpenCV's YAML; LeftOutError if it is none."""
     try:
-        text = read_text(path)
-    except (OSError, ValueError) as error:
-        raise FormatError(f"{path} cannot be read: {error}.") from error
+        return _parse_calibration(read_text(path), path)
+    except (OSError, ValueError, FormatError) as error:
+        raise LeftOutError("without a calibration that can be read") from error
+
+
+def _parse_calibration(text: str, path: Path) -> tuple[Lens, NDArray[np.float64]]:
     sizes = [re.search(rf"^image_{side}\s*:\s*(\d+)", text, re.MULTILINE)
              for side in ("width", "height")]
     matrix = _data(text, "camera_matrix")
@@ -244,8 +223,8 @@ def _fisheye(distortion: list[float]) -> list[float]:
 def _data(text: str, key: str) -> list[float]:
     """Returns the numbers of a matrix in OpenCV's YAML; empty where there is none."""
     block = re.search(rf"^{key}\s*:(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
-    found = re.search(rf"data{_NUMBERS}", block[1]) if block else None
+    numbers = re.search(rf"data{_NUMBERS}", block[1]) if block else None
     try:
-        return [float(one) for one in found[1].split(",")] if found else []
+        return [float(one) for one in numbers[1].split(",")] if numbers else []
     except ValueError:
         return []

@@ -10,16 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from recon_cli.datasets.app_frames import (
-    PICTURES,
-    LeftOut,
-    list_numbered,
-    quoted,
-    tracked_set,
-)
 from recon_cli.datasets.depth_file import lidar_depth
-from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
-from recon_cli.errors import FormatError
+from recon_cli.datasets.frame_files import find_number, list_numbered, quoted
+from recon_cli.datasets.frame_table import FrameTable, read_object, read_size
+from recon_cli.datasets.posed import PosedImage, PosedSet
 
 _POSE = "cameraPoseARFrame"
 
@@ -39,43 +33,21 @@ def is_scanner_app(folder: Path) -> bool:
 
 def read_scanner_app(folder: Path) -> PosedSet:
     """Returns the frames that have a photo; InputError if none has a photo and a pose."""
-    images = list_numbered(folder, PICTURES, "frame_")
-    texts = list_numbered(folder, (".json",), "frame_")
-    depths = list_numbered(folder, (".png",), "depth_")
-    levels = list_numbered(folder, (".png",), "conf_")
-    left_out, listed = LeftOut(), []
+    images = list_numbered(folder, pattern="frame_([0-9]+)")
+    texts = list_numbered(folder, (".json",), "frame_([0-9]+)")
+    depths, levels = (list_numbered(folder, (".png",), f"{kind}_([0-9]+)")
+                      for kind in ("depth", "conf"))
+    table = FrameTable(folder, pictures=f"{quoted(folder)}/frame_*.jpg", opengl=True)
     for number, path in images.items():
-        if number not in texts:
-            left_out.add(path.name, "without a .json")
-            continue
-        image = _list_frame(path, texts[number], left_out)
-        if image is not None:
-            depth = lidar_depth(depths.get(number), levels.get(number), image[0])
-            listed.append(PosedImage(
-                path.name, path, image[0], image[1], depth=depth, time=image[2]))
-    return tracked_set(
-        "3dscannerapp", listed, folder, left_out, photos=f"{quoted(folder)}/frame_*.jpg",
-        bare=len(set(texts) - set(images)))
-
-
-def _list_frame(path: Path, text: Path, left_out: LeftOut) -> Any:
-    """Returns lens, world to camera and time of a frame, None where one cannot be used."""
-    value = left_out.json(text)
-    if value is None:
-        return None
-    try:
-        size = image_size(path)
-    except FormatError:
-        left_out.add(path.name, "that cannot be read")
-        return None
-    viewmat = left_out.pose(path.name, value.get, _POSE, opengl=True)
-    if viewmat is None:
-        return None
-    lens = left_out.lens(path.name, size, _intrinsics, value.get("intrinsics"))
-    if lens is None:
-        return None
-    time = value.get("time")
-    return lens, viewmat, float(time) if isinstance(time, (int, float)) else None
+        with table.frame(path.name):
+            value = read_object(texts.get(number), "without a .json")
+            size = read_size(path)
+            viewmat = table.pose(value.get, _POSE)
+            lens = table.lens(size, _intrinsics, value.get("intrinsics"))
+            table.add(PosedImage(
+                path.name, path, lens, viewmat, time=find_number(value, "time"),
+                depth=lidar_depth(depths.get(number), levels.get(number), lens)))
+    return table.finish_tracked(without_picture=len(texts.keys() - images.keys()))
 
 
 def _intrinsics(matrix: Any) -> tuple[Any, ...]:

@@ -58,20 +58,20 @@ def match_parts(
     for image in images:
         for key in _keys(image, stem=True):
             index.setdefault(key, set()).add(_plain(image))
-    found, unknown, notices = dict[str, str](), list[str](), list[str]()
+    parts, unknown, notices = dict[str, str](), list[str](), list[str]()
     for part in PARTS:
         names = [str(name) for name in lists.get(part, ())]
         if part in lists and not names:
             notices.append(f"{where} names no image for {part}")
         for name in names:
             fitting = next((index[key] for key in _keys(name) if len(index.get(key, ())) == 1), ())
-            found.update(dict.fromkeys(fitting, part))
+            parts.update(dict.fromkeys(fitting, part))
             unknown += [name] * (not fitting)
     if unknown:
         notices.append(f"{where} names {format_count(len(unknown), 'image')} that the set does not "
                        f"have: {list_names(unknown)}")
-    others = "train" if "train" not in lists else "test" if len(lists) == 1 and found else ""
-    return [found.get(_plain(image), others) for image in images], notices
+    others = "train" if "train" not in lists else "test" if len(lists) == 1 and parts else ""
+    return [parts.get(_plain(image), others) for image in images], notices
 
 
 def split_parts(

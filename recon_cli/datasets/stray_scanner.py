@@ -17,18 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.video import open_video, read_declared_length
-from recon_cli.datasets.app_frames import (
-    Y_UP,
-    LeftOut,
+from recon_cli.datasets.depth_file import lidar_depth
+from recon_cli.datasets.frame_files import (
+    find_number,
     fit_intrinsics,
     list_numbered,
     numbers,
     pose_from_quat,
-    quoted,
     read_csv,
-    tracked_set,
 )
-from recon_cli.datasets.depth_file import lidar_depth
+from recon_cli.datasets.frame_table import Y_UP, FrameTable, LeftOutError
 from recon_cli.datasets.phone_gravity import read_gravity
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
@@ -51,40 +49,33 @@ def read_stray(folder: Path) -> PosedSet:
 
     InputError if none has a pose; FormatError if the video or a list is damaged.
     """
-    video, odometry = folder / _VIDEO, folder / _ODOMETRY
-    rows = read_csv(odometry, ("frame", *_POSE))
+    video = folder / _VIDEO
+    rows = read_csv(folder / _ODOMETRY, ("frame", *_POSE))
     size, count = _measure(video)
-    inner, notices = _read_matrix(folder / _MATRIX, size, rows)
+    table = FrameTable(folder, pictures=video)
+    inner = _read_matrix(folder / _MATRIX, size, rows, table)
     depths = list_numbered(folder / "depth", (".png", ".npy"))  # .npy: old versions
     levels = list_numbered(folder / "confidence", (".png",))
-    left_out, listed, seen = LeftOut(), [], set[int]()
+    seen = set[int]()
     for row in rows:
-        name = f"frame {row.get('frame', '?')}"
-        if not row.get("frame", "").isdecimal() or int(row["frame"]) in seen:
-            left_out.add(name, "whose number is missing or repeated")
-            continue
-        number = int(row["frame"])
-        seen.add(number)
-        if count and number >= count:
-            left_out.add(name, f"beyond the {count} of the video")
-            continue
-        viewmat = left_out.pose(name, _pose, row, opengl=False)
-        if viewmat is None:
-            continue
-        lens = left_out.lens(name, size, _intrinsics, row, inner)
-        if lens is None:
-            continue
-        depth = lidar_depth(depths.get(number), levels.get(number), lens)
-        listed.append(PosedImage(
-            f"{number:06d}.png", video, lens, viewmat, depth=depth, frame=number,
-            time=_time(row)))
-    posed = tracked_set(
-        "stray", sorted(listed, key=lambda image: image.name), folder, left_out,
-        photos=quoted(video))
+        with table.frame(f"frame {row.get('frame', '?')}"):
+            if not row.get("frame", "").isdecimal() or int(row["frame"]) in seen:
+                raise LeftOutError("whose number is missing or repeated")
+            number = int(row["frame"])
+            seen.add(number)
+            if count and number >= count:
+                raise LeftOutError(f"beyond the {count} of the video")
+            viewmat = table.pose(_pose, row)
+            lens = table.lens(size, _intrinsics, row, inner)
+            table.add(PosedImage(
+                f"{number:06d}.png", video, lens, viewmat, frame=number,
+                time=find_number(row, "timestamp"),
+                depth=lidar_depth(depths.get(number), levels.get(number), lens)))
+    table.rows.sort(key=lambda image: image.name)
     if count and abs(count - len(rows)) > max(_SPARE_ROWS, _SPARE_SHARE * count):
-        notices.append(f"the video has {count} frames, but {_ODOMETRY} {len(rows)} rows: one of "
-                       "them is cut short, or of another recording")
-    return _check_up(replace(posed, notices=(*posed.notices, *notices)), folder / _IMU)
+        table.notices.append(f"the video has {count} frames, but {_ODOMETRY} {len(rows)} rows: one "
+                             "of them is cut short, or of another recording")
+    return _check_up(table.finish_tracked(), folder / _IMU)
 
 
 def _check_up(posed: PosedSet, imu: Path) -> PosedSet:
@@ -114,30 +105,31 @@ def _measure(video: Path) -> tuple[tuple[int, int], int]:
             size = stream.codec_context.width, stream.codec_context.height
         return size, read_declared_length(video).frames
     except InputError as error:
-        raise FormatError(error.message, hint="Copy the recording again.") from error
+        raise FormatError(error.message) from error
 
 
 def _read_matrix(
-    path: Path, size: tuple[int, int], rows: Sequence[Mapping[str, str]]
-) -> tuple[Sequence[float] | None, list[str]]:
-    """Returns fx, fy, cx, cy for frames without their own, and notices."""
+    path: Path, size: tuple[int, int], rows: Sequence[Mapping[str, str]], table: FrameTable
+) -> Sequence[float] | None:
+    """Returns fx, fy, cx, cy for frames without their own, None if there is none such."""
     if not path.is_file():
         if any(not row.get("fx") for row in rows):
             raise FormatError(
-                f"{path} is missing, and {_ODOMETRY} has no intrinsics of each frame.",
-                hint="Copy the recording again.")
-        return None, []
+                f"{path} is missing, and {_ODOMETRY} has no intrinsics of each frame.")
+        return None
     text = path.read_text(encoding="utf-8", errors="replace").replace(",", " ").split()
     try:
         fx, _, cx, _, fy, cy, _, _, one = (float(number) for number in text)
         if one != 1:
             raise ValueError("another matrix")
     except ValueError as error:
-        raise FormatError(f"{path} does not hold the 9 numbers of a matrix of intrinsics.",
-                          hint="Copy the recording again.") from error
+        raise FormatError(
+            f"{path} does not hold the 9 numbers of a matrix of intrinsics.") from error
     inner, factor = fit_intrinsics((fx, fy, cx, cy), size, str(path))
-    return inner, [f"its intrinsics were scaled by {factor:.4g}: those of {path.name} are for "
-                   "images of another size"] * (factor != 1)
+    if factor != 1:
+        table.notices.append(f"its intrinsics were scaled by {factor:.4g}: those of {path.name} "
+                             "are for images of another size")
+    return inner
 
 
 def _pose(row: Mapping[str, str]) -> NDArray[np.float64]:
@@ -151,10 +143,3 @@ def _intrinsics(row: Mapping[str, str], inner: Sequence[float] | None) -> Sequen
     if inner is None:
         raise KeyError("no intrinsics")
     return inner
-
-
-def _time(row: Mapping[str, str]) -> float | None:
-    try:
-        return float(row["timestamp"])
-    except (KeyError, ValueError):
-        return None

@@ -22,10 +22,11 @@ from PIL import Image
 from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
 from recon_cli.datasets.exported_files import read_cloud
 from recon_cli.datasets.file_finder import FileFinder
+from recon_cli.datasets.frame_files import find_number
+from recon_cli.datasets.frame_table import FrameTable
 from recon_cli.datasets.posed import (
     PosedImage,
     PosedSet,
-    find_images,
     image_size,
     is_file,
     resolve_inside,
@@ -147,34 +148,29 @@ def read_transforms(path: Path) -> PosedSet:
     literature scores it; if it names validation views alone, those are held out. InputError if no
     image exists; FormatError if a file is damaged or a frame incomplete.
     """
-    frames, notices = list[_Frame](), list[str]()
+    table, frames = FrameTable(path), list[_Frame]()
     lists = [(file, part, _read_entries(file)) for file, part in _files(path)]
     finder = FileFinder(path.parent if path.is_file() else path, [
         entry[key] for _, _, (_, entries) in lists for entry in entries
         for key in ("file_path", "depth_file_path", "depth_path", "mask_path") if key in entry])
     for file, part, (common, entries) in lists:
-        found, told = _list_entries(file, part, common, entries, finder)
-        frames += found
-        notices += told
+        in_file, notices = _list_entries(file, part, common, entries, finder)
+        frames += in_file
+        table.notices += notices
     frames, copies = _drop_duplicates(frames)
-    notices += copies
     keep, held_out, split = split_parts([frame.part for frame in frames], path.name)
-    notices += split
     used = [(frame, held) for frame, kept, held in zip(frames, keep, held_out, strict=True) if kept]
-    listed, missing = [], []
     for (frame, held), name in zip(used, _short_names([one for one, _ in used]), strict=True):
         if is_file(frame.path):
-            listed.append(_list_frame(frame, name, held, finder))
+            table.add(_list_frame(frame, name, held, finder))
         else:
-            missing.append(name)
-    posed = find_images("transforms", listed, path, missing=missing)
-    posed = _add_points(posed, path if path.is_file() else path / _FILE)
-    notices += [*finder.notices(), *_describe_unread([frame for frame, _ in used], listed)]
+            table.missing.append(name)
+    table.notices += [*copies, *split, *finder.notices(),
+                      *_describe_unread([frame for frame, _ in used], table.rows)]
+    posed = _add_points(table.finish(), path if path.is_file() else path / _FILE)
     depth = any(image.depth is not None for image in posed.images)
-    return replace(
-        posed, metric=depth, metric_by_depth=depth,
-        splits=any(image.held_out for image in posed.images),
-        notices=(*notices, *posed.notices))
+    return replace(posed, metric=depth, metric_by_depth=depth,
+                   splits=any(image.held_out for image in posed.images))
 
 
 def list_cameras(path: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
@@ -319,11 +315,10 @@ def _short_names(frames: Sequence[_Frame]) -> list[str]:
 
 def _list_frame(frame: _Frame, name: str, held_out: bool, finder: FileFinder) -> PosedImage:
     lens = read_lens(frame.entry, image_size(frame.path), frame.where)
-    time = frame.entry.get("timestamp")
     return PosedImage(
         name, frame.path, lens, _viewmat(frame), held_out,
         _find_depth(frame, lens, finder), _beside(frame, "mask_path", finder),
-        time=float(time) if isinstance(time, (int, float)) else None)
+        time=find_number(frame.entry, "timestamp"))
 
 
 def _find_depth(frame: _Frame, lens: Lens, finder: FileFinder) -> DepthFile | None:

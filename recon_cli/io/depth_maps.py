@@ -24,6 +24,7 @@ from recon_cli.workspace.json_record import JsonRecord
 from recon_cli.workspace.records import AGAIN
 
 DEPTH, LIST = "depth", "depth.json"
+MEDIAN = 5  # pixels a side of the median that takes a sensor's noise, and leaves edges
 _MOST = 65535  # value of 16 bits
 _WHOLE = 0.02  # of a unit: what float32 leaves of a multiple
 _CONFIDENCE = ".confidence.png"

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.depth_maps import (
+    MEDIAN,
     MOST_NOISE,
     DepthMap,
     find_edges,
@@ -40,7 +41,6 @@ LEAST_NOISE = 0.002  # relative; what depth of 16 bits and the nearest pixel lea
 # A view whose depths are off in the median by this share, or this many times the noise, shows
 # something else than its image, as with timestamps that do not match.
 MOST_OFF, MOST_TIMES_OFF = 0.05, 3.0
-_MEDIAN = 5  # pixels a side, in which edges stay where they are
 _AROUND = np.ones((3, 3), np.uint8)
 
 
@@ -79,7 +79,7 @@ def _read(folder: Path, name: str, one: DepthMap) -> NDArray[np.float32]:
     """Returns the sure depth [h, w] of a map in its own unit, 0 elsewhere and beside edges."""
     depth = read_sure_depth(folder, name, one)
     # of a median, as noise of 2% would be edges everywhere
-    depth[find_edges(cv2.medianBlur(depth, _MEDIAN)) | (cv2.erode(depth, _AROUND) == 0)] = 0
+    depth[find_edges(cv2.medianBlur(depth, MEDIAN)) | (cv2.erode(depth, _AROUND) == 0)] = 0
     return depth
 
 

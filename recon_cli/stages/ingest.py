@@ -7,11 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from recon_cli.capture import from_photos, from_video
-from recon_cli.capture.archives import refuse_other_file
-from recon_cli.capture.foreign import FOREIGN, find_foreign
 from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import IngestedSource, merge_sources
+from recon_cli.capture.known_files import KNOWN_FILES, find_foreign, refuse_other_file
 from recon_cli.capture.photo_tree import find_photo_files, find_videos
 from recon_cli.capture.spherical_video import refuse_unusable
 from recon_cli.config.stages import IngestConfig, parse_holdout
@@ -162,7 +161,7 @@ def _tell_many(config: IngestConfig, frames: int, ctx: StageContext) -> None:
 
 def _tell_foreign(video: Path, ctx: StageContext) -> None:
     """Says which poses and depth an app has left beside its video."""
-    if any(row.video == video.name for row in FOREIGN):
+    if any(row.video == video.name for row in KNOWN_FILES):
         for found in find_foreign(video.absolute().parent):
             if found.row.video == video.name:
                 ctx.notice(found.notice(video))

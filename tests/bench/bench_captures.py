@@ -26,7 +26,7 @@ from pose_errors import Poses, compare, model_poses, reference_poses, trident_po
 from scipy.spatial.transform import Rotation
 from workbench import FOLDER, print_head, print_row, read_json, run_recon
 
-from recon_cli.capture.decoded_picture import Gap
+from recon_cli.capture.decoded_picture import LostPacket
 from recon_cli.capture.video import decode
 
 HEADINGS = (
@@ -110,7 +110,8 @@ def dumped(path: str, stride: int) -> Callable[[Path, Path], Path]:
     def write(data: Path, out: Path) -> Path:
         folder = out / "photos"
         folder.mkdir(parents=True, exist_ok=True)
-        pictures = (item for item in decode(data / path, threads=1) if not isinstance(item, Gap))
+        pictures = (item for item in decode(data / path, threads=1)
+                    if not isinstance(item, LostPacket))
         for number, picture in enumerate(itertools.islice(pictures, 0, None, stride), 1):
             Image.fromarray(picture.rgb()).save(folder / f"{number:04d}.jpg", quality=95)
         return folder

@@ -10,7 +10,7 @@ import zipfile
 
 import pytest
 
-from recon_cli.capture.archives import is_archive, refuse_other_file
+from recon_cli.capture.known_files import is_archive, refuse_other_file
 from recon_cli.errors import InputError
 
 

@@ -36,7 +36,7 @@ from media import (
 from recon_cli.capture.decoded_picture import (
     ROUNDED,
     DecodedPicture,
-    Gap,
+    LostPacket,
     Tags,
     nearest_orientation,
     read_tags,
@@ -475,4 +475,5 @@ def test_whole_frames_are_those_of_the_undamaged_video(tmp_path, packet):
             np.testing.assert_array_equal(picture.rgb(), truth[picture.frame.pts])
     # A group of five, and one frame on either side.
     assert scan.lost <= 7
-    assert len(damaged) + sum(isinstance(item, Gap) for item in decode(path, threads=1)) == 20
+    lost = sum(isinstance(item, LostPacket) for item in decode(path, threads=1))
+    assert len(damaged) + lost == 20

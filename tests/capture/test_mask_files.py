@@ -3,8 +3,7 @@ from pathlib import PurePosixPath
 import posed_sets
 import pytest
 
-from recon_cli.capture.mask_files import mask_folders, match_masks
-from recon_cli.capture.masks import find_masks
+from recon_cli.capture.masks import find_masks, mask_folders, match_masks
 from recon_cli.capture.photo_tree import find_photo_files
 from recon_cli.capture.photos import list_photos
 from recon_cli.datasets.layouts import read_posed

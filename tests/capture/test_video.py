@@ -7,7 +7,7 @@ from av.stream import Disposition
 from media import set_display_matrix, texture, write_sound, write_video
 from PIL import Image
 
-from recon_cli.capture.decoded_picture import DecodedPicture, Gap
+from recon_cli.capture.decoded_picture import DecodedPicture, LostPacket
 from recon_cli.capture.video import (
     codec_name,
     decode,
@@ -195,7 +195,7 @@ def test_frames_that_change_their_size_midway_count_as_lost(tmp_path):
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
     items = list(decode(path, threads=1))
     assert {item.size[0] for item in items if isinstance(item, DecodedPicture)} == {96}
-    assert any(isinstance(item, Gap) for item in items)
+    assert any(isinstance(item, LostPacket) for item in items)
 
 
 def mixed(path, *, cover):

@@ -239,7 +239,7 @@ def test_photos_that_are_elsewhere_are_counted(frames, tmp_path):
     told(read_posed(tmp_path), "missing: 1 of the 4 images")
     for path in tmp_path.glob("*.jpg"):
         path.unlink()
-    refused(tmp_path, "4 photos that it lists are not there")
+    refused(tmp_path, "lists 4 pictures, but none of their files is there")
 
 
 def test_photos_are_found_by_other_suffixes_and_paths(frames, tmp_path):
@@ -323,7 +323,7 @@ def test_a_list_of_another_bundle_is_refused(frames, tmp_path):
     path.write_text(path.read_text().replace("more.jpg\n", ""))
     text = (tmp_path / "bundle.out").read_text()
     (tmp_path / "bundle.out").write_text(text[:len(text) // 2])
-    refused(tmp_path, "cut short|numbers belong")
+    refused(tmp_path, "cut short|has 1 numbers, needed 3")
 
 
 def test_pictures_of_a_headset_that_are_cut_short_are_left_out(frames, tmp_path):

@@ -60,8 +60,8 @@ def test_recognition_opens_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(("make", "lost", "message"), [
-    (make_colmap, "sparse/cameras.txt", "a COLMAP model without cameras.bin"),
-    (posed_sets.make_replica, "traj.txt", "Replica frames without traj.txt"),
+    (make_colmap, "sparse/cameras.txt", "a COLMAP model without sparse/cameras.txt"),
+    (posed_sets.make_replica, "traj.txt", "a Replica sequence without traj.txt"),
     (posed_sets.make_tum, "groundtruth.txt", "a TUM RGB-D sequence without groundtruth.txt"),
 ])
 def test_a_data_set_that_lost_its_poses_is_not_taken_for_photos(tmp_path, make, lost, message):
@@ -76,7 +76,7 @@ def test_frames_of_7_scenes_without_poses_are_not_taken_for_photos(tmp_path):
     posed_sets.make_seven_scenes(tmp_path)
     for path in tmp_path.glob("*.pose.txt"):
         path.unlink()
-    with pytest.raises(FormatError, match="7-Scenes frames without") as refused:
+    with pytest.raises(FormatError, match="a 7-Scenes sequence without frame") as refused:
         refuse_incomplete(tmp_path)
     assert "frame-*.color.*" in refused.value.hint
 

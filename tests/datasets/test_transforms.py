@@ -114,7 +114,7 @@ def test_images_that_are_gone_are_missing_and_need_no_lens(tmp_path):
 
 def test_a_set_without_any_of_its_images_is_refused(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(posed_sets.transforms()))
-    with pytest.raises(InputError, match=r"lists 4 images, but none .* is 0000\.png"):
+    with pytest.raises(InputError, match=r"lists 4 pictures, but none .* is 0000\.png"):
         read_transforms(tmp_path)
 
 

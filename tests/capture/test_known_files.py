@@ -6,7 +6,13 @@ import sqlite3
 import numpy as np
 import pytest
 
-from recon_cli.capture.foreign import FOREIGN, find_foreign, find_lists, recognise_file
+from recon_cli.capture.known_files import (
+    KNOWN_FILES,
+    find_foreign,
+    find_lists,
+    picture_kind,
+    recognise_file,
+)
 from recon_cli.datasets.layouts import LAYOUTS
 
 METASHAPE = ('<?xml version="1.0"?><document version="2.0.0"><chunk><cameras>'
@@ -81,7 +87,7 @@ def test_what_is_read_as_a_data_set_names_the_folder_to_give(tmp_path):
 
 
 def test_every_layout_that_a_row_names_is_read():
-    assert {row.layout for row in FOREIGN} - {""} <= {row.name for row in LAYOUTS}
+    assert {row.layout for row in KNOWN_FILES} - {""} <= {row.name for row in LAYOUTS}
 
 
 @pytest.mark.parametrize(("name", "text"), [
@@ -116,5 +122,15 @@ def test_a_text_that_lists_the_pictures_is_found_whoever_wrote_it(tmp_path):
 
 
 def test_every_row_says_what_is_lost():
-    assert all(row.words and row.carries and row.patterns for row in FOREIGN)
-    assert len({row.words for row in FOREIGN}) == len(FOREIGN)
+    assert all(row.words and row.carries and (row.patterns or row.lost) for row in KNOWN_FILES)
+    assert len({row.words for row in KNOWN_FILES}) == len(KNOWN_FILES)
+
+
+@pytest.mark.parametrize(("name", "kind"), [
+    ("depth", "depth maps"), ("rtabmap_depth", "depth maps"), ("depth_00001", "depth maps"),
+    ("IMG_1_mask", "masks"), ("Masks", "masks"), ("operator_masks", "masks"),
+    ("confidence", "confidence maps"), ("thumbnails", "small copies"),
+    ("normal-maps", "normal maps"),
+    ("images", ""), ("depthless", ""), ("unmasked", ""), ("IMG_0001", ""), ("conference", "")])
+def test_names_tell_what_pictures_show(name, kind):
+    assert picture_kind(name) == kind
