@@ -68,8 +68,8 @@ def read_polycam(folder: Path) -> PosedSet:
                 depth=lidar_depth(depths.get(number), levels.get(number), lens, high=_HIGH)))
     if not kind:
         table.notices.append(
-            "it has no corrected cameras (loop closure was off, or the capture too long): the poses "
-            "drift, and the lens distortion is written nowhere")
+            "it has no corrected cameras (loop closure was off, or the capture too long): the "
+            "poses drift, and the lens distortion is written nowhere")
     return table.finish_tracked()
 
 
