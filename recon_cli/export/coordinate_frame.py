@@ -97,6 +97,8 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
         (one.error for one in _known_sources(world)), default=0.0)
     if frame.fused is None and world and world.evidence.scale_error is not None:
         error = world.evidence.scale_error
+    if world and world.evidence.scale_spread:  # where a length is, is not known
+        error = float(np.hypot(error, world.evidence.scale_spread))
     if world and world.evidence.up_found:
         return RoomFrame(frame.similarity.rotation @ np.array(UP["z"]), error)
     sparse = inputs.folders["sfm"] / "undistorted" / "sparse"

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,11 @@ SHARED_ERRORS = 10.0
 MAX_SCALE_ERROR = 0.05  # of a relative scale; see `tests/bench/bench_scale_breaks.py`
 # Up to here a scale that nothing contradicts is an interval that is said, and no reason to cut.
 MAX_SCALE_INTERVAL = 0.15
-MIN_SURE_EXPLAINED = 0.85  # share of the matches across that the cameras must explain for that
+# It is contradicted where the cameras explain less than this share of the matches across it (wrong
+# photos far apart .63 to .79, right ones .86 and more), and where the floor says that it is more
+# likely off by 10% than by what is fine.
+MIN_SURE_EXPLAINED = 0.85
+MAX_FLOOR_STEP = (MAX_SCALE_ERROR + 0.1) / 2
 DOUBTFUL = MAX_SCALE_ERROR / 3  # the floor is looked at from here on
 _RIDGE = 1e-10  # times the diagonal: position, turn and scale of the model are free
 POSE = 6  # unknowns of a camera: its turn, and its centre
@@ -56,9 +61,21 @@ class ScaleCut(JsonRecord):
     before: str  # the last image before the cut, or the one beside it
     after: str  # the first one behind it
     sides: tuple[tuple[str, ...], tuple[str, ...]]  # names of the images, the smaller side first
-    # of the scales of any two stretches of the walk, likewise: errors along the way add up
+    explained: float = 1.0  # share of the matches across it that the cameras explain
+    # what the heights above the floor say the relative scale is off by, as a share
+    off: float = 0.0
+    # of the scales at both ends of the walk, likewise: the errors along it add up
     drift: float = 0.0
-    contradiction: str = ""  # what speaks against the scale that the model has there
+
+    @property
+    def spread(self) -> float:
+        """By how much lengths in two parts of the model may differ, as `error`."""
+        return max(self.error, self.drift)
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether heights or matches speak against the relative scale that the model has."""
+        return self.off > MAX_FLOOR_STEP or self.explained < MIN_SURE_EXPLAINED
 
 
 def find_weakest_scale(
@@ -96,23 +113,28 @@ def find_weakest_scale(
 def is_scale_known(cut: ScaleCut | None) -> bool:
     """Returns whether no relative scale is too uncertain, or contradicted within its interval."""
     return cut is None or cut.error <= MAX_SCALE_ERROR or (
-        cut.error <= MAX_SCALE_INTERVAL and not cut.contradiction)
+        cut.error <= MAX_SCALE_INTERVAL and not cut.is_contradicted)
 
 
 def describe_scale(cut: ScaleCut) -> str:
     """Returns how well the scale is known across a cut, in a sentence."""
+    if cut.error <= MAX_SCALE_ERROR:
+        ends = f", both ends of the walk to {cut.drift:.1%}" if cut.drift else ""
+        return ("Scale: the two sides of any cut are known to "
+                f"{cut.error:.1%} or better relative to each other{ends}.")
     text = (f"The scale of {format_count(len(cut.sides[0]), 'camera')} on one side of the cut "
             f"between {cut.before} and {cut.after} relative to the "
             f"{format_count(len(cut.sides[1]), 'other')} is known to {cut.error:.0%} only")
-    if not is_scale_known(cut):
-        why = f" and {cut.contradiction}" if cut.error <= MAX_SCALE_INTERVAL else (
-            ": the two sides share too few points that show depth")
-        return f"{text}, but {MAX_SCALE_ERROR:.0%} is needed{why}."
-    if cut.error > MAX_SCALE_ERROR:
-        return f"{text}; nothing contradicts it, so lengths on both sides differ by as much."
-    return ("Scale: the two sides of any cut are known to "
-            f"{cut.error:.1%} or better relative to each other"
-            f"{f', any two stretches of the walk to {cut.drift:.1%}' if cut.drift else ''}.")
+    if is_scale_known(cut):
+        return f"{text}, so that lengths on both sides may differ by as much."
+    if cut.error > MAX_SCALE_INTERVAL:
+        why = "the two sides share too few points that show depth"
+    elif cut.off > MAX_FLOOR_STEP:
+        why = f"by the heights above the floor it is off by {cut.off:.0%}"
+    else:
+        why = (f"the cameras explain {cut.explained:.0%} of the matches across it, and for less "
+               f"certainty {MIN_SURE_EXPLAINED:.0%} are needed")
+    return f"{text}, but {MAX_SCALE_ERROR:.0%} is needed: {why}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +180,8 @@ def _ask_floor(cut: _Cut, heights: NDArray[np.float64]) -> _Cut:
 
     Both are taken for normal: what is most likely wrong then, or its deviation if that is more.
     """
-    place = cut.ends[1]
-    step = compare_heights(heights, place) if cut.side[:place].all() else None
+    changes = np.flatnonzero(np.diff(cut.side)) + 1
+    step = compare_heights(heights, int(changes[0])) if len(changes) == 1 else None
     if step is None:
         return cut
     share = cut.error**2 / (cut.error**2 + SPREAD**2)
@@ -168,22 +190,13 @@ def _ask_floor(cut: _Cut, heights: NDArray[np.float64]) -> _Cut:
 
 
 def _describe(cut: _Cut, evidence: MatchEvidence, rows: Rows, drift: float) -> ScaleCut:
-    """Returns a cut by the names of its images, with what contradicts the scale of the model."""
+    """Returns a cut by the names of its images, and how far the matches across it confirm it."""
     sides = [tuple(evidence.names[row] for row in rows[side]) for side in (cut.side, ~cut.side)]
     first, second = sorted(sides, key=len)
     before, after = (evidence.names[rows[end]] for end in cut.ends)
-    return ScaleCut(cut.error, before, after, (first, second), drift, (
-        "" if cut.error <= MAX_SCALE_ERROR else _contradict(cut, evidence, rows)))
-
-
-def _contradict(cut: _Cut, evidence: MatchEvidence, rows: Rows) -> str:
-    """Returns what speaks against the relative scale that a model has across a cut, in words."""
-    if cut.off > MAX_SCALE_ERROR:
-        return f"the height above the floor changes by {cut.off:.0%} there"
-    explained = _explained_across(evidence, *(rows[part] for part in cut.parts))
-    return "" if explained >= MIN_SURE_EXPLAINED else (
-        f"the cameras explain {explained:.0%} of the matches across it, but "
-        f"{MIN_SURE_EXPLAINED:.0%} are needed for less")
+    return ScaleCut(
+        cut.error, before, after, (first, second),
+        _explained_across(evidence, *(rows[part] for part in cut.parts)), cut.off, drift)
 
 
 def _explained_across(evidence: MatchEvidence, ours: Rows, theirs: Rows) -> float:
@@ -192,17 +205,20 @@ def _explained_across(evidence: MatchEvidence, ours: Rows, theirs: Rows) -> floa
     sides[ours], sides[theirs] = 1, 2
     across = sides[evidence.pairs].prod(axis=1) == 2
     matches = int(evidence.matches[across].sum())
-    return float(evidence.explained[across].sum()) / matches if matches else 0.0
+    return float(evidence.explained[across].sum()) / matches if matches else 1.0
 
 
 def _sum_drift(information: _Information) -> float:
-    """Returns how well the relative scale of any two stretches of a walk is known, at the worst."""
-    count, stretches = len(information.centers), []
-    rest = np.arange(count)
+    """Returns how well the relative scale of both ends of a walk is known.
+
+    The errors from one stretch to the next add up by their squares. Loops that the walk closes are
+    given no credit: what many observations share is off alike, wherever the walk comes back to.
+    """
+    stretches, rest = [], np.arange(len(information.centers))
     while len(rest) and (stretch := information.stretch(rest, rest)) is not None:
         stretches.append(stretch)
         rest = rest[len(stretch):]
-    return information.largest_error(stretches)
+    return float(np.linalg.norm([information.error(*both) for both in pairwise(stretches)]))
 
 
 class _Information:
@@ -218,16 +234,8 @@ class _Information:
 
     def error(self, before: Rows, behind: Rows) -> float:
         """Returns how well the relative scale of two stretches is known, as `ScaleCut.error`."""
-        return self.largest_error((before, behind))
-
-    def largest_error(self, stretches: Sequence[Rows]) -> float:
-        """Returns how well the relative scale of any two of some stretches is known at worst."""
-        if len(stretches) < 2:
-            return 0.0
-        changes = np.stack([self._scale_of(rows) for rows in stretches], axis=1)
-        covariance = self._variance * changes.T @ self._factor.solve(changes)
-        own = np.diag(covariance)
-        variance = float((own[:, None] + own - covariance - covariance.T).max())
+        change = self._scale_of(behind) - self._scale_of(before)
+        variance = self._variance * float(change @ self._factor.solve(change))
         return SHARED_ERRORS * float(np.sqrt(max(variance, 0.0)))
 
     def reached(self, rows: Rows, others: Rows) -> float:

@@ -38,6 +38,7 @@ from recon_cli.sfm.flat_views import (
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.parts import check_part
 from recon_cli.sfm.results import PlacedResult, UndistortedResult
+from recon_cli.sfm.scale_drift import ScaleCut
 from recon_cli.sfm.scale_evidence import ask_device
 from recon_cli.sfm.shared_points import to_sim3d
 from recon_cli.sfm.undistort_faces import write_views
@@ -76,14 +77,18 @@ def place_model(job: MappingJob) -> PlacedResult:
     refuse_contradiction(world.evidence, accepted=job.accept_weak)
     if device.remark:
         world = dataclasses.replace(world, sentences=(*world.sentences, device.remark))
+    verdict = atomic.read_json(part / VERDICT) if (part / VERDICT).exists() else {}
+    if verdict.get("scale"):
+        world = dataclasses.replace(world, evidence=dataclasses.replace(
+            world.evidence, scale_spread=ScaleCut.from_json(verdict["scale"]).spread))
     model.transform(to_sim3d(world.similarity))
     folder = fresh_folder(job.out / "sparse.partial")
     write_model(model, folder)
     publish(folder, job.out / "sparse")
     summary = world.summary()
     atomic.write_json(job.out / WorldSummary.FILE, summary.to_json())
-    if (part / VERDICT).exists():
-        atomic.write_json(job.out / VERDICT, atomic.read_json(part / VERDICT))
+    if verdict:
+        atomic.write_json(job.out / VERDICT, verdict)
     return PlacedResult(world=summary)
 
 

@@ -97,6 +97,8 @@ class WorldEvidence(JsonRecord):
     metres: bool  # one world unit is one metre
     scale_error: float | None = None  # relative standard error of a fused scale
     scale_sources: tuple[Mapping[str, Any], ...] = ()  # that were fused, or contradict the others
+    # relative standard error of the scale of one part of the capture against that of another
+    scale_spread: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,11 +4,16 @@ DATA is the folder of test data, and OUT that of `bench_verdict`, whose captures
 they are not yet. Each good walk is cut where the relative scale of both sides is known least: as it
 is, and made a turn in a narrow place by leaving across the cut only matches of frames up to 2
 apart, or of neighbours, and of those the FEW that show what is furthest away. One side is scaled by
-3, 10 and 25%, and all is triangulated and adjusted again, as sfm does. A line shows what scale is
-left (a good one mends itself), how well it is said to be known, the open loops, and the verdict. A
-model is broken from BROKEN on, and good up to SOUND where no match was left out; others count as
-neither. Behind it: of every third capture, which are kept from the choice, how many are decided
-wrongly by the bound that lies in the middle of those of the others.
+3, 10 and 30%, and all is triangulated and adjusted again, as sfm does. A line shows what scale is
+left (a good one mends itself), how well it is said to be known, which share of the matches across
+the cameras explain, what the floor says, the open loops, and the verdict. A model is broken from
+BROKEN on, and good up to SOUND; others count as neither.
+
+Drifts: only matches of frames up to 2 apart are left, and the scale grows by 2, 5 and 10% along the
+walk; what is left between its ends is compared with the interval of 95% that is said.
+
+Behind it: the share of explained matches that decides the most models of every second capture, and
+how it decides those of the others.
 
 --walk MODEL DATABASE TRUTH adds a model with its database, whose frames are numbered by the lines
 of TRUTH, camera to world: as mapped, it is good or broken by the scales of its stretches.
@@ -34,12 +39,23 @@ from verdict_variants import ordered_poses
 from workbench import FOLDER, print_head, print_row
 
 from recon_cli.sfm import mapper
+from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.merge_models import build_posed_model, drop_outliers
-from recon_cli.sfm.scale_drift import MAX_SCALE_ERROR, find_weakest_scale
-from recon_cli.sfm.verdict import ModelVerdict, examine
+from recon_cli.sfm.scale_drift import (
+    MAX_FLOOR_STEP,
+    MAX_SCALE_ERROR,
+    MAX_SCALE_INTERVAL,
+    MIN_SURE_EXPLAINED,
+    ScaleCut,
+    find_weakest_scale,
+    is_scale_known,
+)
+from recon_cli.sfm.verdict import ModelVerdict, examine, find_order
 
-FACTORS = (1.03, 1.10, 1.25)
+FACTORS = (1.03, 1.10, 1.30)
+DRIFTS = (1.02, 1.05, 1.10)  # from the first frame of a walk to the last
+SIGMAS = 1.96  # of an interval of 95%
 # Across the cut: frames up to so far apart, None for all, and matches of each pair of them.
 FEW = 40
 TIES = ((None, None), (2, None), (1, FEW), (1, FEW // 2))
@@ -47,7 +63,8 @@ BROKEN, SOUND = 0.10, 0.03  # of a relative scale that is left
 STRETCH = 20  # cameras on either side of a cut that its scale is taken from
 DEFAULT = ("fox", "living", "office", "living_noisy", "office_noisy", "study_walk",
            "lobby_walk", "loop")
-HEADS = ("capture", "made", "cameras", "scale left", "known to", "loops", "label", "verdict", "")
+HEADS = ("capture", "made", "cameras", "scale left", "known to", "explained", "floor", "drift said",
+         "loops", "label", "verdict", "")
 Array = NDArray[np.float64]
 
 
@@ -61,6 +78,9 @@ class Row:
     left: float  # of the relative scale, as a share
     label: str
     error: float  # how well the scale is said to be known; 0 where nothing tells
+    explained: float  # share of the matches across that the cameras explain
+    off: float  # by the floor
+    drift: float  # said, of the ends of the walk
     loops: int  # that are open
     trusted: bool
     otherwise: bool  # anything but how well the scale is known speaks against the model
@@ -70,37 +90,56 @@ class Row:
         cls, capture: str, made: str, cameras: str, left: float, label: str, verdict: ModelVerdict
     ) -> Row:
         """The row of a model."""
-        error = 0.0 if verdict.scale is None else verdict.scale.error
-        by_scale = not verdict.open_loops and error > MAX_SCALE_ERROR
-        return cls(capture, made, cameras, left, label, error, len(verdict.open_loops),
-                   verdict.trusted, len(verdict.problems) > by_scale)
+        cut = verdict.scale or ScaleCut(0.0, "", "", ((), ()))
+        by_scale = not verdict.open_loops and not is_scale_known(cut)
+        return cls(capture, made, cameras, left, label, cut.error, cut.explained, cut.off,
+                   cut.drift, len(verdict.open_loops), verdict.trusted,
+                   len(verdict.problems) > by_scale)
 
-    def is_wrong(self, bound: float) -> bool:
-        """Whether it is decided wrongly by a bound of the error."""
-        refused = self.otherwise or self.error > bound
-        return {"good": refused, "broken": not refused}.get(self.label, False)
+    def is_wrong(self, explained: float = MIN_SURE_EXPLAINED) -> bool:
+        """Whether it is decided wrongly, by a bound of the explained matches within the interval.
+
+        A drift is, where it is more than the interval that is said.
+        """
+        if self.label == "drift":
+            return self.trusted and self.left > SIGMAS * max(self.drift, self.error)
+        known = self.error <= MAX_SCALE_ERROR or (
+            self.error <= MAX_SCALE_INTERVAL and self.off <= MAX_FLOOR_STEP
+            and self.explained >= explained)
+        refused = self.otherwise or self.loops > 0 or not known
+        return {"good": refused and self.error <= MAX_SCALE_INTERVAL,
+                "broken": not refused}.get(self.label, False)
 
     def cells(self) -> tuple[str, ...]:
         """Its cells of the table."""
         return (self.capture, self.made, self.cameras, f"{self.left:.3f}", f"{self.error:.3f}",
-                 str(self.loops), self.label or "-", "trusted" if self.trusted else "refused",
-                 "WRONG" if self.is_wrong(MAX_SCALE_ERROR) else "")
+                f"{self.explained:.2f}", f"{self.off:.3f}", f"{self.drift:.3f}", str(self.loops),
+                self.label or "-", "trusted" if self.trusted else "refused",
+                "WRONG" if self.is_wrong() else "")
 
 
-def relative_scale(before: Array, after: Array, place: int) -> float:
-    """How the scale behind a place changed against that before it, as a share; both [F, 3]."""
+def relative_scale(before: Array, after: Array, place: int | None) -> float:
+    """How the scale behind a place changed against that before it, as a share; both [F, 3].
+
+    Of the last frames against the first without a place.
+    """
     def scale(rows: slice) -> float:
         return similarity(before[rows], after[rows])[0]
 
-    change = scale(slice(place, place + STRETCH)) / scale(slice(max(0, place - STRETCH), place))
+    sides = (slice(STRETCH), slice(-STRETCH, None)) if place is None else (
+        slice(max(0, place - STRETCH), place), slice(place, place + STRETCH))
+    change = scale(sides[1]) / scale(sides[0])
     return abs(float(np.expm1(abs(np.log(change)))))
 
 
 def thin_ties(
-    path: Path, base: pycolmap.Reconstruction, order: Sequence[str], place: int,
+    path: Path, base: pycolmap.Reconstruction, order: Sequence[str], place: int | None,
     ties: tuple[int | None, int | None],
 ) -> None:
-    """Deletes matches across a place in the order: of frames far apart, and of what is near."""
+    """Deletes matches across a place in the order: of frames far apart, and of what is near.
+
+    Of all frames without a place.
+    """
     reach, few = ties
     if reach is None:
         return
@@ -110,7 +149,7 @@ def thin_ties(
         for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             pair = pycolmap.pair_id_to_image_pair(number)
             low, high = sorted(rows.get(names[image], -1) for image in pair)
-            if not low < place <= high:
+            if place is not None and not low < place <= high:
                 continue
             opened.delete_two_view_geometry(*pair)
             opened.delete_matches(*pair)
@@ -136,10 +175,13 @@ def depths(
 
 
 def scaled(
-    job: MappingJob, base: pycolmap.Reconstruction, place: int, factor: float,
+    job: MappingJob, base: pycolmap.Reconstruction, place: int | None, factor: float,
     ties: tuple[int | None, int | None],
 ) -> tuple[pycolmap.Reconstruction, MappingJob]:
-    """A model whose cameras from a place on are scaled about the first of them, adjusted again."""
+    """A model whose cameras from a place on are scaled about the first of them, adjusted again.
+
+    Without a place the scale grows from frame to frame.
+    """
     own = dataclasses.replace(job, out=job.out / "scaled")
     shutil.rmtree(own.out, ignore_errors=True)
     own.attempts.mkdir(parents=True)
@@ -147,10 +189,14 @@ def scaled(
     poses = ordered_poses(job, base)
     names = list(poses)
     thin_ties(own.database, base, names, place, ties)
-    pivot = poses[names[place]].inverse().translation
-    motion = pycolmap.Sim3d(factor, pycolmap.Rotation3d(), (1 - factor) * pivot)
-    moved = {name: motion.transform_camera_world(pose) if row >= place else pose
-             for row, (name, pose) in enumerate(poses.items())}
+    places = range(1, len(names)) if place is None else (place,)
+    motion, moved = pycolmap.Sim3d(), {names[0]: poses[names[0]]}
+    for row, name in enumerate(names[1:], 1):
+        if row in places:  # about where the walk has come to
+            each = factor ** (1 / len(places))
+            pivot = motion * poses[name].inverse().translation
+            motion = pycolmap.Sim3d(each, pycolmap.Rotation3d(), (1 - each) * pivot) * motion
+        moved[name] = motion.transform_camera_world(poses[name])
     model = mapper.triangulate(own, build_posed_model(own.database, base, moved))
     mapper.refine(own, model)
     return model, own
@@ -168,25 +214,28 @@ def rows_of(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
     own = examine(base, job.database, job.names, times=job.times)
     yield Row.from_verdict(
         capture.name, "mapped", f"{own.registered}/{own.images}", 0.0, "good", own)
-    cut = find_weakest_scale(base, names)
+    evidence = gather_evidence(base, job.database, job.names)
+    cut = find_weakest_scale(base, evidence, find_order(evidence, job.times),
+                             between=(names[0], names[-1]))
     place = len(names) // 2 if cut is None else names.index(cut.after)
-    for ties in TIES:
-        for factor in FACTORS:
-            model, made = scaled(job, base, place, factor, ties)
-            candidate = drop_outliers(made, mapper.sharpen(model))
-            found = {image.name: image.projection_center() for image in map(
-                candidate.model.image, candidate.model.reg_image_ids())}
-            rows = [row for row, name in enumerate(names) if name in found]
-            left = relative_scale(
-                centers[rows], np.array([found[names[row]] for row in rows]),
-                sum(row < place for row in rows))
-            label = "broken" if left >= BROKEN else (
-                "good" if left <= SOUND and ties == TIES[0] else "")
-            what = "all matches" if ties == TIES[0] else (
-                f"up to {ties[0]} apart" + (f", {ties[1]} far" if ties[1] else ""))
-            yield Row.from_verdict(
-                capture.name, f"x {factor:g}, {what}", f"{len(rows)}/{len(names)}", left, label,
-                candidate.verdict)
+    made: list[tuple[float, int | None, tuple[int | None, int | None]]] = [
+        *((factor, place, ties) for ties in TIES for factor in FACTORS),
+        *((factor, None, TIES[1]) for factor in DRIFTS)]
+    for factor, at, ties in made:
+        model, kept = scaled(job, base, at, factor, ties)
+        candidate = drop_outliers(kept, mapper.sharpen(model))
+        found = {image.name: image.projection_center() for image in map(
+            candidate.model.image, candidate.model.reg_image_ids())}
+        rows = [row for row, name in enumerate(names) if name in found]
+        left = relative_scale(
+            centers[rows], np.array([found[names[row]] for row in rows]),
+            None if at is None else sum(row < at for row in rows))
+        label = "broken" if left >= BROKEN else "good" if left <= SOUND else ""
+        what = "all matches" if ties == TIES[0] else (
+            f"up to {ties[0]} apart" + (f", {ties[1]} far" if ties[1] else ""))
+        yield Row.from_verdict(
+            capture.name, f"x {factor:g}{' on the way' if at is None else ''}, {what}",
+            f"{len(rows)}/{len(names)}", left, "drift" if at is None else label, candidate.verdict)
 
 
 def read_or_make(capture: Capture, data: Path, out: Path) -> Iterator[Row]:
@@ -214,25 +263,24 @@ def walk_row(model_folder: Path, path: Path, truth: Path) -> Row:
     scales = [similarity(centers[start:start + STRETCH], known[start:start + STRETCH])[0]
               for start in range(0, len(held) - STRETCH, STRETCH // 2)]
     left = float(np.quantile(scales, 0.9) / np.quantile(scales, 0.1)) - 1
-    label = "broken" if left >= BROKEN else "good"
+    label = "broken" if left >= BROKEN else "drift"
     return Row.from_verdict(model_folder.resolve().name, "as mapped", f"{len(held)}/{len(names)}",
                             left, label, verdict)
 
 
 def held_out(rows: Sequence[Row]) -> Iterator[str]:
-    """What a bound from two thirds of the captures decides on the others, in turn."""
+    """What the best bound of explained matches from half of the captures decides on the others."""
     captures = sorted({row.capture for row in rows})
-    for third in range(3):
-        kept = set(captures[third::3])
-        others = [row for row in rows if row.capture not in kept and not row.otherwise]
-        most = max((row.error for row in others if row.label == "good"), default=0.0)
-        least = min((row.error for row in others if row.label == "broken" and row.error > most),
-                    default=2 * MAX_SCALE_ERROR)
-        bound = (most + least) / 2
-        own = [row for row in rows if row.capture in kept and row.label]
-        wrong = [f"{row.capture} {row.made}" for row in own if row.is_wrong(bound)]
-        yield (f"without {', '.join(sorted(kept))}: bound {bound:.3f}; {len(wrong)} of {len(own)} "
-               f"wrong {'; '.join(wrong)}")
+    for half in (0, 1):
+        chosen = set(captures[half::2])
+        bounds = np.arange(0.5, 1.0, 0.01)
+        wrong = [sum(row.is_wrong(bound) for row in rows if row.capture in chosen)
+                 for bound in bounds]
+        bound = float(np.median(bounds[np.array(wrong) == min(wrong)]))
+        others = [row for row in rows if row.capture not in chosen]
+        yield (f"by {', '.join(sorted(chosen))}: {bound:.2f} of the matches explained "
+               f"({min(wrong)} wrong); {sum(row.is_wrong(bound) for row in others)} of "
+               f"{len(others)} others wrong")
 
 
 @click.command()
@@ -254,10 +302,12 @@ def main(data: Path, out: Path, names: tuple[str, ...], walk: tuple[tuple[Path, 
             for row in read_or_make(capture, data, out):
                 rows.append(row)
                 print_row(*row.cells())
-    for label in ("good", "broken"):
+    for label in ("good", "broken", "drift"):
         own = [row for row in rows if row.label == label]
-        wrong = sum(row.is_wrong(MAX_SCALE_ERROR) for row in own)
-        click.echo(f"{label}: {len(own)} models, {wrong} decided wrongly")
+        between = [row for row in own if MAX_SCALE_ERROR < row.error <= MAX_SCALE_INTERVAL]
+        click.echo(f"{label}: {len(own)} models, {sum(row.is_wrong() for row in own)} decided "
+                   f"wrongly; {len(between)} known to {MAX_SCALE_ERROR:.0%} to "
+                   f"{MAX_SCALE_INTERVAL:.0%}, {sum(row.trusted for row in between)} trusted")
     for line in held_out(rows):
         click.echo(line)
 

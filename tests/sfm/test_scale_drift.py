@@ -4,19 +4,26 @@ A camera every half metre along a wall; where the cameras of both halves see not
 what is far away, neither half says how large the other one is.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import pycolmap
 import pytest
-from made_model import FOCAL, HEIGHT, WIDTH, MadeModel, along, wall
+from made_model import FOCAL, HEIGHT, WIDTH, MadeModel, along, moved, wall
 from scipy.spatial.transform import Rotation
 
+from recon_cli.sfm import mapper
 from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.limits import LOSS_SCALE
 from recon_cli.sfm.scale_drift import (
     MAX_SCALE_ERROR,
+    MAX_SCALE_INTERVAL,
+    MIN_SURE_EXPLAINED,
     SHARED_ERRORS,
+    ScaleCut,
+    describe_scale,
     find_weakest_scale,
     is_scale_known,
 )
@@ -51,12 +58,13 @@ def near(count: int) -> np.ndarray:
     return wall(3, 9, count=count, seed=4)
 
 
-def weakest(made: MadeModel, *, ordered: bool = True, **options):
+def weakest(made: MadeModel, *, model=None, ordered: bool = True, **options):
+    model = made.model() if model is None else model
     with TemporaryDirectory() as folder:
         database = made.write_database(Path(folder) / "database.db")
-        evidence = gather_evidence(made.model(), database, made.names)
+        evidence = gather_evidence(model, database, made.names)
     order = np.arange(len(made.names)) if ordered else None
-    return find_weakest_scale(made.model(), evidence, order, **options)
+    return find_weakest_scale(model, evidence, order, **options)
 
 
 def test_what_both_halves_see_near_by_ties_their_scales():
@@ -78,6 +86,87 @@ def test_the_cut_is_searched_between_two_images_where_they_are_named():
     made = halves(far(60))
     cut = weakest(made, between=(made.names[6], made.names[11]))
     assert made.names[6] <= cut.before < cut.after <= made.names[11]
+
+
+def test_photos_without_an_order_are_cut_where_few_points_tie_them():
+    made = halves(far(60), count=14)
+    cut = weakest(made, ordered=False)
+    assert not is_scale_known(cut)
+    assert set(cut.sides) == {tuple(made.names[:7]), tuple(made.names[7:])}
+    assert is_scale_known(weakest(halves(near(300), count=14), ordered=False))
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_a_side_that_collapsed_is_measured_by_itself(ordered):
+    """One half shrinks with all that it alone sees; the distance is as it was."""
+    made = halves(far(60))
+    model = made.model()
+    pivot = model.find_image_with_name(made.names[12]).projection_center()
+    for name in made.names[12:]:
+        image = model.find_image_with_name(name)
+        turn = image.cam_from_world().rotation
+        center = pivot + (image.projection_center() - pivot) / 2400
+        image.frame.rig_from_world = pycolmap.Rigid3d(turn, -(turn.matrix() @ center))
+    for number, point in model.points3D.items():
+        if all(element.image_id > 12 for element in point.track.elements):
+            model.point3D(number).xyz = pivot + (point.xyz - pivot) / 2400
+    cut = weakest(made, model=model, ordered=ordered)
+    assert not is_scale_known(cut)
+    assert cut.error > MAX_SCALE_INTERVAL
+
+
+@pytest.mark.parametrize("error", [0.06, 0.10, 0.15])
+def test_a_scale_that_nothing_contradicts_is_an_interval_and_no_reason_to_cut(error):
+    cut = ScaleCut(error, "a", "b", (("a",), ("b",)))
+    assert is_scale_known(cut)
+    assert f"{error:.0%}" in describe_scale(cut)
+    assert cut.spread == error
+    assert replace(cut, drift=0.2).spread == 0.2
+    assert not is_scale_known(replace(cut, off=0.09)), "the floor says so"
+    assert not is_scale_known(replace(cut, explained=0.7)), "matches contradict"
+    assert not is_scale_known(replace(cut, error=0.16))
+
+
+def test_the_matches_across_contradict_a_half_of_another_scale():
+    made = halves(far(60))
+    right = weakest(made)
+    model = made.model()
+    for name in made.names[12:]:  # moved aside, so that what both see lies elsewhere
+        image = model.find_image_with_name(name)
+        image.frame.rig_from_world = image.cam_from_world() * moved(0, 0.8, 0)
+    assert weakest(made, model=model).explained < MIN_SURE_EXPLAINED <= right.explained
+
+
+@pytest.mark.parametrize("drift", [0.02, 0.05, 0.10])
+def test_a_drift_that_observations_leave_is_inside_the_interval(drift):
+    """Points are seen from five cameras in a row: nothing else ties the ends of the walk."""
+    count = 40
+    walls = wall(-3, count * 0.5 + 3, count=60 * count)
+    first = np.clip(np.round(walls[:, 0] / 0.5).astype(int) - 2, 0, count - 5)
+    hidden = {index: np.flatnonzero((first > index) | (first < index - 4))
+              for index in range(count)}
+    made = NoisyModel(walls, along(np.arange(count) * 0.5), hidden=hidden)
+    model = made.model()
+    each = (1 + drift) ** (1 / (count - 1))
+    growth = each ** np.arange(count)
+    start = np.array([model.image(index + 1).projection_center() for index in range(count)])
+    centers = start[0] + np.concatenate([
+        np.zeros((1, 3)), np.cumsum(np.diff(start, axis=0) * growth[1:, None], axis=0)])
+    for number, point in model.points3D.items():
+        row = min(element.image_id for element in point.track.elements) - 1
+        model.point3D(number).xyz = centers[row] + growth[row] * (point.xyz - start[row])
+    for row in range(count):
+        turn = model.image(row + 1).cam_from_world().rotation
+        model.image(row + 1).frame.rig_from_world = pycolmap.Rigid3d(
+            turn, -(turn.matrix() @ centers[row]))
+    mapper.adjust(model)
+    found = np.array([model.image(index + 1).projection_center() for index in range(count)])
+    lengths = np.linalg.norm(np.diff(found, axis=0), axis=1) / np.linalg.norm(
+        np.diff(start, axis=0), axis=1)
+    left = abs(np.log(np.median(lengths[-10:]) / np.median(lengths[:10])))
+    cut = weakest(made, model=model)
+    assert left <= 1.96 * cut.drift < 0.3
+    assert cut.drift > cut.error, "the errors along the walk add up"
 
 
 def test_a_camera_that_stands_still_moves_too_little_for_its_scale_to_matter():

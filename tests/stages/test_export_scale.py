@@ -93,6 +93,14 @@ def know_scale(inputs, **more):
     (inputs.folders["sfm"] / "world.json").write_text(json.dumps(world.summary().to_json()))
 
 
+def spread_scale(inputs, spread):
+    """Says how far the scales of two parts of the capture may differ."""
+    path = inputs.folders["sfm"] / "world.json"
+    world = json.loads(path.read_text())
+    world["evidence"]["scale_spread"] = spread
+    path.write_text(json.dumps(world))
+
+
 def measured(metres):
     return ExportConfig(scale_between=("000000.png", "000006.png", metres))
 
@@ -143,3 +151,12 @@ def test_measures_carry_the_interval_of_the_scale_that_sfm_found(inputs, error):
     know_scale(inputs, sources=sources)  # without any, the data set's own unit
     frame = choose_frame(ExportConfig(), inputs)
     assert find_room_frame(inputs, frame).scale_error == pytest.approx(error)
+
+
+@pytest.mark.parametrize("config", [ExportConfig(), measured(APART)])
+def test_measures_carry_how_far_the_scale_drifts_within_the_capture(inputs, config):
+    know_scale(inputs)
+    own = find_room_frame(inputs, choose_frame(config, inputs)).scale_error
+    spread_scale(inputs, 0.08)
+    carried = find_room_frame(inputs, choose_frame(config, inputs)).scale_error
+    assert carried == pytest.approx(np.hypot(own, 0.08))

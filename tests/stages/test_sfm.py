@@ -148,6 +148,9 @@ def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
     assert sorted(path.name for path in out.iterdir()) == [
         "database.db", "log.txt", "parts", "sparse", "steps.json", "undistorted", "verdict.json",
         "world.json"]
+    scale, world = (json.loads((out / name).read_text()) for name in ("verdict.json", "world.json"))
+    assert world["evidence"]["scale_spread"] == max(
+        scale["scale"]["error"], scale["scale"]["drift"]) > 0
     assert sorted(path.name for path in (out / "undistorted").iterdir()) == [
         "denoised", "images", "sparse"]
     for folder in (out / "sparse", out / "undistorted" / "sparse"):
