@@ -98,4 +98,4 @@ def _without_similarity(centers: NDArray[np.float64]) -> NDArray[np.float64]:
     shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
     free = np.concatenate([shifts, turns, arms[None]]).reshape(7, -1)
     basis = np.linalg.svd(free, full_matrices=False)[2]
-    return np.eye(centers.size) - basis.T @ basis
+    return np.asarray(np.eye(centers.size) - basis.T @ basis, np.float64)
