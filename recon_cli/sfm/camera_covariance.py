@@ -29,8 +29,8 @@ MAX_CAMERA_ERROR, MAX_MODEL_ERROR = 0.02, 0.03
 # independent ones: three quarters of the cameras of living and fox were off by up to 5.3 times what
 # these would leave, and of office by up to 6.2 (`tests/bench/bench_thinned.py`).
 SHARED_ERRORS = 5.0
-# COLMAP itself asks for so many to place a camera, if thresholds are not relaxed. Fewer may agree by
-# chance, which no covariance shows: one with 22 points was off by a tenth, and known to a hundredth.
+# COLMAP itself asks for so many to place a camera, if thresholds are not relaxed. Fewer may agree
+# by chance, which no covariance shows: one with 22 points was off by a tenth of the extent.
 MIN_CAMERA_POINTS = 30
 MOST_NAMED = 5
 MOST_CAMERAS = 300  # of more it takes longer than seconds
@@ -98,4 +98,4 @@ def _without_similarity(centers: NDArray[np.float64]) -> NDArray[np.float64]:
     shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
     free = np.concatenate([shifts, turns, arms[None]]).reshape(7, -1)
     basis = np.linalg.svd(free, full_matrices=False)[2]
-    return np.eye(centers.size) - basis.T @ basis
+    return np.asarray(np.eye(centers.size) - basis.T @ basis, np.float64)

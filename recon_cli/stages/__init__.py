@@ -105,7 +105,7 @@ def _format_stage(row: ExportFormat) -> Stage:
 STAGES: tuple[Stage, ...] = (
     Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 6, False,
           "recon_cli.stages.ingest", input_metavar="VIDEO"),
-    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 3, True,
+    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 4, True,
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 4, True,
           "recon_cli.stages.sfm",

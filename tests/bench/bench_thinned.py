@@ -300,7 +300,8 @@ def count(rows: Sequence[Row]) -> str:
         known) else "-"
     return (f"over {WRONG:g}% of the extent and trusted: {len(trusted)} of {len(wrong)}, "
             f"{len(silent)} of them without a rough camera; cameras off by times what is thought "
-            f"(50, 75, 90%): {shares}; under {RIGHT:g}% and refused: {len(refused)} of {len(right)}; without a model: "
+            f"(50, 75, 90%): {shares}; under {RIGHT:g}% and refused: {len(refused)} of "
+            f"{len(right)}; without a model: "
             f"{sum(not row.judged for row in rows)} of {len(rows)}")
 
 

@@ -80,3 +80,13 @@ def test_the_number_of_threads_changes_no_pixel():
 def test_a_frame_of_a_few_pixels_can_be_filtered():
     assert bilateral(np.full((3, 2, 3), 90, np.uint8), 5, STRENGTH).tolist() == [
         [[90] * 3] * 2] * 3
+
+
+def test_a_large_frame_is_measured_by_the_middle_of_its_tiles():
+    generator = np.random.default_rng(0)
+    frame = np.clip(np.rint(generator.normal(120, 6, (1600, 2000, 3))), 0, 255).astype(np.uint8)
+    measured = estimate_noise(frame)
+    assert measured == pytest.approx(6, rel=0.05)
+    outside = frame.copy()
+    outside[:40], outside[-40:], outside[:, :50], outside[:, -50:] = 0, 255, 0, 255
+    assert estimate_noise(outside) == measured

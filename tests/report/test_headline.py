@@ -32,6 +32,13 @@ def test_a_mapping_that_was_accepted_although_weak_is_not_to_be_trusted():
     assert "The model is broken." in verdict.lines
 
 
+def test_rough_cameras_are_named_above_a_sound_model():
+    verdict = judge_poses(sfm(
+        verdict={"trusted": True, "rough": ["000007.png"]}, lines=["head"]))
+    assert verdict.level == "warn"
+    assert "000007.png" in verdict.text
+
+
 def test_poses_of_a_data_set_are_neither_praised_nor_blamed():
     verdict = judge_poses(
         sfm(verdict=None, poses={"use": "keep", "metric": True}, lines=["100% agree."]))
