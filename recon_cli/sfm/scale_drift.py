@@ -179,12 +179,14 @@ def _walk_cuts(information: _Information, places: Iterable[int]) -> Iterator[_Cu
 
 
 def _ask_floor(cut: _Cut, heights: NDArray[np.float64], panoramas: bool) -> _Cut:
-    """Returns a cut once the heights [F, 2] of its cameras are known, too."""
-    place = cut.ends[1]
+    """Returns a cut once the heights [F, 2] of its cameras are known, too: of one that parts a walk
+    in two, or of any between panoramas.
+    """
+    changes = np.flatnonzero(np.diff(cut.side)) + 1
     if panoramas:
         step = compare_sides(*(heights[part] for part in cut.parts))
     else:
-        step = compare_heights(heights, place) if cut.side[:place].all() else None
+        step = compare_heights(heights, int(changes[0])) if len(changes) == 1 else None
     if step is None:
         return cut
     error, off = weigh_step(cut.error, step)
