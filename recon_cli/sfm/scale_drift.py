@@ -184,7 +184,7 @@ def _ask_floor(cut: _Cut, heights: NDArray[np.float64], panoramas: bool) -> _Cut
     """
     changes = np.flatnonzero(np.diff(cut.side)) + 1
     if panoramas:
-        step = compare_sides(*(heights[part] for part in cut.parts))
+        step = compare_sides(heights[cut.parts[0]], heights[cut.parts[1]])
     else:
         step = compare_heights(heights, int(changes[0])) if len(changes) == 1 else None
     if step is None:
