@@ -22,9 +22,8 @@ CONE_DEG = 8.0  # between the floor's normal and what is up for all cameras
 # Between the down axis of a panorama and the mean of all, in the median: those of a tripod or of a
 # camera that levels them agree by .55 degrees in an empty flat.
 LEVEL_DEG = 2.0
-# Images on either side of a cut whose heights are compared, and how many must know theirs.
+# Images on either side of a cut in a walk whose heights are compared, and how many must know them.
 COMPARED, LEAST_HEIGHTS = 60, 10
-LEAST_PANORAMAS = 2  # likewise, of panoramas: a tripod stands still
 # Steps of the log of that height on good walks, as a standard deviation: .02 to .07 on eight, .05
 # by their squares. One larger than the other is to another surface, such as a table.
 SPREAD, MAX_LOG_STEP = 0.05, 0.4
@@ -86,7 +85,7 @@ def compare_heights(heights: NDArray[np.float64], place: int) -> float | None:
 
 def compare_sides(
     before: NDArray[np.float64], behind: NDArray[np.float64],  # [B, 2], [C, 2]
-    least: int = LEAST_PANORAMAS,
+    least: int = 1,
 ) -> float | None:
     """Returns the log of the heights of some cameras over those of others; None as above.
 

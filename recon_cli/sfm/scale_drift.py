@@ -185,7 +185,7 @@ def _walk_cuts(information: _Information, places: Iterable[int]) -> Iterator[_Cu
 def _ask_floor(cut: _Cut, heights: NDArray[np.float64], panoramas: bool) -> _Cut:
     """Returns a cut once the heights [F, 2] of its cameras are known, too."""
     if panoramas:
-        step = compare_sides(*(heights[part] for part in cut.parts))
+        step = compare_sides(heights[cut.parts[0]], heights[cut.parts[1]])
     else:
         changes = np.flatnonzero(np.diff(cut.side)) + 1
         step = compare_heights(heights, int(changes[0])) if len(changes) == 1 else None

@@ -6,6 +6,7 @@ import pytest
 from panoramas import HEIGHT, WIDTH, make_panoramas
 from scipy.spatial.transform import Rotation
 
+from recon_cli.sfm import floor_heights
 from recon_cli.sfm.evidence import explained_matches, gather_evidence
 from recon_cli.sfm.scale_drift import find_weakest_scale
 from recon_cli.sfm.sphere import epipolar_errors, radian_px, ray_frames, unit_rays
@@ -122,8 +123,10 @@ def joined_by_a_hinge(model, common):
     return joined
 
 
-def test_two_groups_that_meet_in_one_panorama_have_scales_of_their_own(captured):
+def test_two_groups_that_meet_in_one_panorama_have_scales_of_their_own(captured, monkeypatch):
     job, model = captured
+    monkeypatch.setattr(floor_heights, "LEVEL_DEG", -1.0)  # as if the camera leant
+    monkeypatch.setattr(floor_heights, "find_floor", lambda *_, **__: None)
     verdict = examine(joined_by_a_hinge(model, 0), job.database, job.names)
     assert verdict.scale is not None
     assert verdict.scale.error > 1
@@ -131,6 +134,14 @@ def test_two_groups_that_meet_in_one_panorama_have_scales_of_their_own(captured)
     assert smaller in (job.names[:5], job.names[6:]), "the sixth joins them"
     assert sorted(smaller + larger) == list(job.names)
     assert any("on one side of the cut" in problem for problem in verdict.problems)
+
+
+def test_floor_and_ceiling_give_both_groups_one_scale(captured):
+    job, model = captured
+    joined = joined_by_a_hinge(model, 0)
+    scale = find_weakest_scale(joined, gather_evidence(joined, job.database, job.names))
+    assert scale.error < 0.05
+    assert scale.off < 0.05
 
 
 def test_points_that_both_groups_see_give_them_one_scale(captured):
