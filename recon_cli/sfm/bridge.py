@@ -147,7 +147,8 @@ def _find_bridges(
     """Yields pairs in order, each with its bridge if there is one."""
     def find(pair: Pair) -> pycolmap.TwoViewGeometry | None:
         known = verified[pair].inlier_matches if pair in verified else np.zeros((0, 2))
-        return find_bridge(*(photos[name] for name in pair), known.astype(np.int64), seed=job.seed)
+        first, second = (photos[name] for name in pair)
+        return find_bridge(first, second, known.astype(np.int64), seed=job.seed)
 
     ordered = sorted(pairs)
     with ThreadPoolExecutor(job.threads) as pool:
@@ -231,7 +232,7 @@ def epipolar_distances(
     ours, theirs = (np.column_stack([xy, np.ones(len(xy))]) for xy in (first, second))
     lines, back = ours @ fundamental.T, theirs @ fundamental
     slope = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-    return np.abs((theirs * lines).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-12))
+    return np.asarray(np.abs((theirs * lines).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-12)))
 
 
 def near_epipolar_lines(

@@ -121,12 +121,12 @@ def doors(_: Path, count: int) -> dict[str, View]:
     camera = pycolmap.Camera(model="PINHOLE", width=800, height=600, params=[500, 500, 400, 300])
     for place, x in enumerate(DOORS):
         for index in range(max(4, count // 4)):
-            along = np.linspace(-1.2, 1.2, max(4, count // 4))[index]
-            center = np.array([x + along + generator.normal(0, 0.1), generator.normal(1.5, 0.1),
-                               generator.uniform(-0.3, 0.5)])
+            along = np.linspace(-2.2, 2.2, max(4, count // 4))[index]
+            center = np.array([x + along + generator.normal(0, 0.1), generator.normal(1.5, 0.15),
+                               generator.uniform(0.2, 1.2)])
             turn = Rotation.from_euler("yxz", [
-                -0.45 * along + generator.normal(0, 0.08), generator.normal(0, 0.05),
-                generator.normal(0, 0.03)]).as_matrix()
+                -np.arctan2(along, center[2] + HALF) + generator.normal(0, 0.08),
+                generator.normal(0, 0.05), generator.normal(0, 0.03)]).as_matrix()
             pose = np.eye(4)
             pose[:3, :3] = np.diag([1, -1, -1]) @ turn  # looks along -z at the wall, y down
             pose[:3, 3] = center
@@ -140,8 +140,13 @@ def doors(_: Path, count: int) -> dict[str, View]:
 LENGTH, TALL, HALF, PIXELS, DOORS = 14.0, 2.6, 1.4, 150, (3.0, 11.0)
 
 
-def make_corridor(generator: np.random.Generator) -> dict[str, NDArray[np.uint8]]:
-    """Textures of its four surfaces: grain, some things on the walls, and the doors."""
+# A rectangle: the axis that it is normal to, where on it, its corner and size, its texture.
+Surface = tuple[int, float, tuple[float, float], tuple[float, float], NDArray[np.uint8]]
+
+
+def make_corridor(generator: np.random.Generator) -> list[Surface]:
+    """The walls, floor and ceiling: grain, some things on them, the doors, and boards before them.
+    """
     def grained(height: float, level: float) -> NDArray[np.float64]:
         shape = int(height * PIXELS), int(LENGTH * PIXELS)
         coarse = cv2.resize(generator.normal(0, 4, (shape[0] // 30, shape[1] // 30)), shape[::-1])
@@ -154,6 +159,15 @@ def make_corridor(generator: np.random.Generator) -> dict[str, NDArray[np.uint8]
             cv2.rectangle(surface, (int(x), int(y)), (int(x + w), int(y + h)),
                           generator.integers(20, 230, 3).tolist(), -1)
 
+    def board(size: tuple[float, float]) -> NDArray[np.uint8]:
+        image = np.full((int(size[1] * PIXELS), int(size[0] * PIXELS), 3), 120.0)
+        image += generator.normal(0, 4, image.shape)
+        for _ in range(12):
+            x, y = (int(generator.integers(0, side)) for side in image.shape[1::-1])
+            colour = generator.integers(0, 256, 3).tolist()
+            cv2.rectangle(image, (x, y), (x + 12, y + 8), colour, -1)
+        return np.clip(image, 0, 255).astype(np.uint8)
+
     found = {"front": grained(TALL, 190), "back": grained(TALL, 180),
              "floor": grained(2 * HALF, 110), "ceiling": grained(2 * HALF, 220)}
     door = make_door(np.random.default_rng(7))
@@ -162,17 +176,31 @@ def make_corridor(generator: np.random.Generator) -> dict[str, NDArray[np.uint8]
         clutter(found["floor"], 60, middle, 0)
         x, y = int((middle - 0.5) * PIXELS), len(found["front"]) - len(door)
         found["front"][y:, x:x + door.shape[1]] = door
-    return {name: np.clip(surface, 0, 255).astype(np.uint8) for name, surface in found.items()}
+    for wall in ("left", "between", "right"):  # so that no photo shows both places
+        found[wall] = grained(TALL, 170)
+    planes = {"front": (2, -HALF), "back": (2, HALF), "floor": (1, 0.0), "ceiling": (1, TALL),
+              "left": (0, 0.0), "between": (0, LENGTH / 2), "right": (0, LENGTH)}
+    surfaces: list[Surface] = [
+        (*planes[name], (0.0, 0.0), (LENGTH, 2 * HALF if planes[name][0] == 1 else TALL),
+         np.clip(texture, 0, 255).astype(np.uint8)) for name, texture in found.items()]
+    for middle, side in itertools.product(DOORS, (-1, 1)):
+        for _ in range(3):
+            size = (float(generator.uniform(0.25, 0.5)), float(generator.uniform(0.3, 0.8)))
+            corner = (middle + side * float(generator.uniform(0.9, 1.9)) - size[0] / 2,
+                      float(generator.uniform(0.4, TALL - 1.0)))
+            surfaces.append((2, -HALF + float(generator.uniform(0.2, 0.7)), corner, size,
+                             board(size)))
+    return surfaces
 
 
 def make_door(generator: np.random.Generator) -> NDArray[np.float64]:
-    """A door of one by 2.1 metres with panels, a handle, a sign and much grain."""
+    """A door of one by 2.1 metres with panels, a handle, a notice and some grain."""
     shape = int(2.1 * PIXELS), PIXELS
-    door = np.repeat((130 + cv2.resize(generator.normal(0, 14, (160, 4)), shape[::-1])
+    door = np.repeat((130 + cv2.resize(generator.normal(0, 8, (40, 4)), shape[::-1])
                       + generator.normal(0, 5, shape))[:, :, None], 3, axis=2) * [0.7, 0.85, 1.1]
     for top, bottom in ((15, 130), (160, 300)):
         cv2.rectangle(door, (18, top), (shape[1] - 18, bottom), (60, 70, 80), 3)
-    for _ in range(40):
+    for _ in range(14):
         x, y = generator.integers([20, 20], [shape[1] - 30, 120])
         cv2.rectangle(door, (int(x), int(y)), (int(x) + 12, int(y) + 5),
                       generator.integers(0, 256, 3).tolist(), -1)
@@ -181,22 +209,23 @@ def make_door(generator: np.random.Generator) -> NDArray[np.float64]:
 
 
 def draw(
-    walls: Mapping[str, NDArray[np.uint8]], pose: Array, camera: pycolmap.Camera
+    surfaces: Sequence[Surface], pose: Array, camera: pycolmap.Camera
 ) -> NDArray[np.float64]:
     """A photo of the corridor by rays, four a pixel."""
     fx, fy, cx, cy = camera.params
     y, x = np.mgrid[0:2 * camera.height, 0:2 * camera.width] / 2 + 0.25
     rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], axis=2) @ pose[:3, :3].T
     image, nearest = np.zeros((*x.shape, 3)), np.full(x.shape, np.inf)
-    planes = {"front": (2, -HALF), "back": (2, HALF), "floor": (1, 0.0), "ceiling": (1, TALL)}
-    for name, (axis, at) in planes.items():
+    for axis, at, corner, size, texture in surfaces:
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = (at - pose[axis, 3]) / rays[:, :, axis]
-        spot = pose[:3, 3] + np.nan_to_num(far)[:, :, None] * rays
-        across = TALL - spot[:, :, 1] if axis == 2 else spot[:, :, 2] + HALF
-        seen = cv2.remap(walls[name], (spot[:, :, 0] * PIXELS).astype(np.float32),
-                         (across * PIXELS).astype(np.float32), cv2.INTER_LINEAR)
-        hit = (far > 0) & (far < nearest)
+            far = np.nan_to_num((at - pose[axis, 3]) / rays[:, :, axis])
+        spot = pose[:3, 3] + far[:, :, None] * rays
+        right = spot[:, :, 2] + HALF if axis == 0 else spot[:, :, 0] - corner[0]
+        down = spot[:, :, 2] + HALF if axis == 1 else TALL - spot[:, :, 1] - corner[1]
+        seen = cv2.remap(texture, (right * PIXELS).astype(np.float32),
+                         (down * PIXELS).astype(np.float32), cv2.INTER_LINEAR)
+        hit = (far > 0) & (far < nearest) & (right > 0) & (right < size[0]) & (
+            down > 0) & (down < size[1])
         image[hit], nearest[hit] = seen[hit], far[hit]
     return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
