@@ -21,6 +21,7 @@ from recon_cli.train.plan import QUALITIES
 pytestmark = pytest.mark.floors
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGE = "export.html"  # which a whole run exports
 
 
 @pytest.fixture(autouse=True)
@@ -59,14 +60,14 @@ def test_each_verb_runs_its_stage_and_says_what_came_of_it(capsys: Said) -> None
 
 def test_run_does_everything_and_ends_with_its_results(capsys: Said) -> None:
     assert main(["run", "room.mp4", "--set", "train.iterations=9"]) == 0
-    assert fake_stages.ran == NAMES
+    assert fake_stages.ran == [*NAMES, PAGE]
     assert config_of("train")["iterations"] == 9
     assert config_of("prune")["at"] == "mid"
     out = capsys.readouterr().out
     assert out.endswith("\nthe end of workspace\n")
     assert "the table of evaluate" not in out
     assert main(["run", "--set", "train.iterations=9"]) == 0
-    assert fake_stages.ran == NAMES
+    assert fake_stages.ran == [*NAMES, PAGE]
 
 
 def test_eval_prints_its_table_and_what_the_scores_mean_only_where_asked(capsys: Said) -> None:
@@ -85,7 +86,7 @@ def test_eval_prints_its_table_and_what_the_scores_mean_only_where_asked(capsys:
 
 def test_run_can_leave_pruning_out() -> None:
     assert main(["run", "room.mp4", "--no-prune"]) == 0
-    assert fake_stages.ran == [name for name in NAMES if name != "prune"]
+    assert fake_stages.ran == [*(name for name in NAMES if name != "prune"), PAGE]
 
 
 def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
@@ -94,7 +95,7 @@ def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
     monkeypatch.setattr(stages, "SAMPLE", Path("room.mp4").absolute())
     monkeypatch.setenv("RECON_WORKSPACE", "elsewhere")
     assert main(["demo", "--set", "train.iterations=10"]) == 0
-    assert fake_stages.ran == NAMES
+    assert fake_stages.ran == [*NAMES, PAGE]
     train = config_of("train", "demo")
     assert train["iterations"] == 10  # what is typed wins
     out = capsys.readouterr().out
@@ -168,7 +169,7 @@ def test_status_shows_state_and_reason(capsys: Said) -> None:
     capsys.readouterr()
     assert main(["status"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 1 + len(NAMES)
+    assert [line.split()[0] for line in lines[1:]] == [*NAMES, PAGE]
     assert "fresh" in lines[1]
     assert "train.iterations changed: automatic -> 7" in lines[4]
 
@@ -300,7 +301,7 @@ def test_clean_keeps_every_finished_result_fresh(
     assert "database.db" in capsys.readouterr().out
     assert not Path("workspace/.partial/train").exists()
     assert not Path("workspace/sfm/database.db").exists()
-    assert states() == ["fresh"] * len(NAMES)
+    assert states() == ["fresh"] * len([*NAMES, PAGE])
 
 
 def test_clean_keeps_small_logs() -> None:

@@ -89,7 +89,7 @@ def test_one_damaged_manifest_stops_neither_status_nor_clean_for_the_others(
     states = {stage.name: stage.state for stage in plan.status(job)}
     assert states == {"ingest": "fresh", "denoise": "fresh", "sfm": "fresh", "train": "damaged",
                       "prune": "stale", "evaluate": "stale", "export": "stale"}
-    (job.workspace.root / ".old").mkdir()
+    (job.workspace.root / ".old").mkdir(exist_ok=True)
     (job.workspace.root / ".partial").mkdir(exist_ok=True)
     (job.workspace.root / ".partial" / "junk").write_text("x")
     assert [item.path.name for item in free_space(job)] == ["junk"]
