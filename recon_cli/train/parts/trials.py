@@ -197,7 +197,7 @@ class Trials:
         if self.scene.twins is None or config.images != "denoised":
             return self.task.train
         return [replace(twin, depth=view.depth)
-                for twin, view in zip(self.scene.twins()[0], self.task.train, strict=True)]
+                for twin, view in zip(self.scene.twins(), self.task.train, strict=True)]
 
     def score(
         self, splats: Splats, views: Sequence[TrainView], sh_degree: int, level: int = LEVEL,
