@@ -60,11 +60,9 @@ def examine(scene: TrialScene) -> Needs:
     """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     trials, config = Trials(scene), scene.config
     for part in TRIED:
-        is_open = getattr(config, part.name) == AUTO if part.is_open is None else (
-            part.is_open(scene))
-        if is_open:
-            settle = part.settle or (lambda trials, config, part=part: trials.settle(part, config))
-            config = with_part(config, part, settle(trials, config))
+        if part.is_open(scene) if part.is_open else getattr(config, part.name) == AUTO:
+            value = part.settle(trials, config) if part.settle else trials.settle(part, config)
+            config = with_part(config, part, value)
     return Needs(config, tuple(trials.decisions), trials.masks)
 
 
