@@ -116,9 +116,9 @@ class Trials:
         rows = part.telling(self.scene, scored) if part.telling else range(len(scored))
         if len(rows) < 2:
             return skip_trial(part.name, "too few of the views to score see any of it")
+        off, on = (with_part(config, part, value) for value in part.values)
         try:
-            return self.compare(part.name, *(with_part(config, part, value)
-                                             for value in part.values), rule, rows=rows)
+            return self.compare(part.name, off, on, rule, rows=rows)
         except OutOfTime:
             return skip_trial(part.name, NO_TIME, on=rule.unless_worse)
 
