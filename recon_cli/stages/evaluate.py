@@ -58,7 +58,8 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
 from recon_cli.train.masks import read_summary, with_masks
-from recon_cli.train.parts.moving import FINER, SIDE, ViewComparer, find_in_held_out
+from recon_cli.train.parts.moving import FINER, ViewComparer, find_in_held_out
+from recon_cli.train.parts.moving_regions import SIDE
 from recon_cli.train.parts.photometry import read_falloffs
 from recon_cli.train.runner import LOG, seconds_at
 from recon_cli.train.train_data import read_config

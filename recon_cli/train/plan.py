@@ -321,11 +321,10 @@ def choose_parts(
     """
     config = task.schedule.config
 
-    def twins() -> tuple[list[TrainView], list[TrainView]]:
+    def twins() -> list[TrainView]:
         denoised = dataclasses.replace(config, images="denoised")
         file = None if task.train[0].file is None else image_file(ctx)
-        return ([*load_views(scene.train, denoised, ctx, file)],
-                [*load_views(scene.validation, denoised, ctx, file)])
+        return [*load_views(scene.train, denoised, ctx, file)]
 
     changed = config.images == "auto" and any(
         not filecmp.cmp(view.original, view.denoised, shallow=False) for view in scene.train)

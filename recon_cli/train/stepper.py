@@ -19,6 +19,7 @@ from torch import Tensor
 from recon_cli.errors import TrainingError
 from recon_cli.render import Statistics
 from recon_cli.render.contract import StepOptions
+from recon_cli.render.response import ResponseGradient
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.densification import STRATEGIES, Strategy
 from recon_cli.train.gradient import DeferredStep, gradient_step
@@ -109,7 +110,7 @@ class Stepper:
         plan = self._plan(state.iteration + 1)
         batch = [next_view(state, task) for _ in range(count)]
         mean = _MeanGradient(state, plan, count, variance=self._strategy.variance)
-        losses, responses = np.zeros(count), {}
+        losses, responses = np.zeros(count), dict[int, ResponseGradient | None]()
         for place, index in enumerate(batch):
             view = task.pyramid.view(index, plan.level)
             response = None if state.photometry is None else state.photometry.response(index)
@@ -196,9 +197,11 @@ class AsyncStepper(Stepper):
         self._trail.append(_Before(state.iteration, list(state.queue), state.generator.get_state()))
         plan, count = self._plan(state.iteration + 1), task.schedule.config.batch_views
         mean = _MeanGradient(state, plan, count, variance=self._strategy.variance)
-        status, seen = self._deferred.status, None
+        status = self._deferred.status
+        seen: Tensor | None = None
         before = status.skipped.clone() if count > 1 else None
-        self._loss.zero_()
+        if count > 1:
+            self._loss.zero_()
         for _ in range(count):
             view = task.pyramid.view(next_view(state, task), plan.level)
             mean.add(self._deferred.start(state.optimizer, view, plan.options), view)

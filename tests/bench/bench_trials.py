@@ -36,7 +36,6 @@ from recon_cli.evaluation.metrics import corrected_psnr, psnr
 from recon_cli.evaluation.reference_views import render_view
 from recon_cli.scene.scene import Scene
 from recon_cli.train.parts.sparse_points import estimate_gains
-from recon_cli.train.parts.table import PARTS
 from recon_cli.train.plan import Facts, cap, choose_parts, count_detail, first_config
 from recon_cli.train.schedule import Schedule
 from recon_cli.train.task import Task
@@ -44,10 +43,10 @@ from recon_cli.train.train_data import load_task, load_views
 
 VALIDATION = 0.2  # share of the training views: as many views as trials hold out by themselves
 DEGREE = "sh-degree"
-ALL = (*PARTS, DEGREE)
 SWITCHED = {  # the other value of a part
-    "far": ("off", "on"), "stereo": ("off", "on"), "exposure": ("off", "on"),
+    "background": ("off", "on"), "stereo": ("off", "on"), "exposure": ("off", "on"),
     "images": ("original", "denoised")}
+ALL = (*SWITCHED, DEGREE)
 
 
 class Capture:

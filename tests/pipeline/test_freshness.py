@@ -191,6 +191,18 @@ def test_a_choice_that_no_longer_exists_is_of_another_version(job: Job) -> None:
     assert "`recon train --iterations 100`" in caught.value.hint
 
 
+def test_an_option_that_was_stored_under_its_earlier_name_makes_nothing_stale(job: Job) -> None:
+    manifest = job.workspace.manifest("train")
+    assert manifest
+    stored = dict(manifest.key.config)
+    stored["far"] = stored.pop("background")
+    replace(manifest, key=replace(manifest.key, config=stored)).write(
+        job.workspace.folder("train"))
+    assert stale(job) == {}
+    record_options(job, far="on")
+    assert stale(job) == {}  # an unset option is that of the result
+
+
 def record_options(job: Job, **options: object) -> None:
     """Writes options into the manifest of train, as another version of recon might have."""
     manifest = job.workspace.manifest("train")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon_cli.evaluation.metrics import corrected_psnr
-from recon_cli.train.parts.decisions import LEAST_VIEWS, Rule, decide, skip_trial, split
+from recon_cli.train.parts.decisions import LEAST_SCORED, Rule, decide, skip_trial, split
 
 BASE = [20.0, 31.0, 25.0, 28.0, 22.0, 33.0, 27.0, 24.0]
 
@@ -83,9 +83,9 @@ def test_what_is_skipped_costs_nothing_and_says_why():
 
 
 def test_enough_validation_views_are_what_a_trial_scores():
-    chosen = split(80, LEAST_VIEWS)
+    chosen = split(80, LEAST_SCORED)
     assert not chosen.own
-    assert (chosen.train, chosen.held_out) == (tuple(range(80)), tuple(range(LEAST_VIEWS)))
+    assert (chosen.train, chosen.held_out) == (tuple(range(80)), tuple(range(LEAST_SCORED)))
 
 
 def test_with_few_validation_views_each_sixth_training_view_is_held_out():

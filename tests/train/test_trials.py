@@ -55,6 +55,16 @@ def test_one_exposure_for_all_needs_no_trial_but_a_drift():
     assert reasons(even)["exposure"].startswith("one exposure")
 
 
+def test_denoised_images_that_show_something_else_are_not_trained_on():
+    made = scene(config=replace(CONFIG, images="auto", background="off", exposure="off"))
+    twins = [replace(view, stored=view.image // 2) for view in made.task.train]
+    needs = examine(replace(made, twins=lambda: twins))
+    assert needs.config.images == "original"
+    assert next(one for one in needs.decisions if one.name == "images").mean_db < -1
+    assert examine(made).config.images == "original"
+    assert "images" not in reasons(examine(made))
+
+
 def test_surfaces_by_stereo_are_used_without_a_trial():
     needs = examine(scene())
     assert needs.config.stereo == "on"

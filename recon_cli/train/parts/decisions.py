@@ -16,7 +16,7 @@ from recon_cli.workspace.summaries import TrialDecision
 THRESHOLD_DB = 0.05
 _ERRORS = 1.65  # standard errors, a chance of about one in twenty
 _ERRORS_AGAINST = 1.0  # of a loss; what is on without a trial needs less to go off
-LEAST_VIEWS = 8  # whose mean has a standard error that can be told; fewer, and the split is own
+LEAST_SCORED = 8  # whose mean has a standard error that can be told; fewer, and the split is own
 _SPLIT = 6  # each sixth training view is held out by an own split, or sooner each third or more
 _DENSEST = 3  # of few views; the rest must still hang together
 
@@ -88,14 +88,14 @@ class Split:
 def split(training: int, validation: int) -> Split | None:
     """Returns the views of a trial; None where there are too few for any.
 
-    The validation views are scored if there are LEAST_VIEWS. Otherwise each sixth training view in
+    The validation views are scored if there are LEAST_SCORED. Otherwise each sixth training view in
     the order of the capture is, down to each third; the final run then trains on all of them.
     """
-    if validation >= LEAST_VIEWS:
+    if validation >= LEAST_SCORED:
         return Split(tuple(range(training)), tuple(range(validation)), own=False)
-    step = max(_DENSEST, min(_SPLIT, training // LEAST_VIEWS))
+    step = max(_DENSEST, min(_SPLIT, training // LEAST_SCORED))
     held_out = tuple(range(step // 2, training, step))
-    if len(held_out) < LEAST_VIEWS:
+    if len(held_out) < LEAST_SCORED:
         return None
     train = tuple(i for i in range(training) if i not in held_out)
     return Split(train, held_out, own=True)

@@ -36,8 +36,8 @@ class TrialScene:
     task: Task  # views at the training size, and the plan
     points: NDArray[np.float64]  # [P, 3] sparse points in world units
     colors: NDArray[np.uint8]  # [P, 3] uint8
-    # reads the denoised training and validation views; None where the task's views are the same
-    twins: Callable[[], tuple[list[TrainView], list[TrainView]]] | None
+    # reads the denoised training views; None where the task's views are the same
+    twins: Callable[[], list[TrainView]] | None
     harmonics: bool = False  # the degree of the colours is left to a trial
     # of the training views, then of the validation views; they sort as they were taken
     names: tuple[str, ...] = ()

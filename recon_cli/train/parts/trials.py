@@ -60,11 +60,9 @@ def examine(scene: TrialScene) -> Needs:
     """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     trials, config = Trials(scene), scene.config
     for part in TRIED:
-        is_open = getattr(config, part.name) == AUTO if part.is_open is None else (
-            part.is_open(scene))
-        if is_open:
-            settle = part.settle or (lambda trials, config, part=part: trials.settle(part, config))
-            config = with_part(config, part, settle(trials, config))
+        if part.is_open(scene) if part.is_open else getattr(config, part.name) == AUTO:
+            value = part.settle(trials, config) if part.settle else trials.settle(part, config)
+            config = with_part(config, part, value)
     return Needs(config, tuple(trials.decisions), trials.masks)
 
 
@@ -118,9 +116,9 @@ class Trials:
         rows = part.telling(self.scene, scored) if part.telling else range(len(scored))
         if len(rows) < 2:
             return skip_trial(part.name, "too few of the views to score see any of it")
+        off, on = (with_part(config, part, value) for value in part.values)
         try:
-            return self.compare(part.name, *(with_part(config, part, value)
-                                             for value in part.values), rule, rows=rows)
+            return self.compare(part.name, off, on, rule, rows=rows)
         except OutOfTime:
             return skip_trial(part.name, NO_TIME, on=rule.unless_worse)
 
@@ -197,7 +195,7 @@ class Trials:
         if self.scene.twins is None or config.images != "denoised":
             return self.task.train
         return [replace(twin, depth=view.depth)
-                for twin, view in zip(self.scene.twins()[0], self.task.train, strict=True)]
+                for twin, view in zip(self.scene.twins(), self.task.train, strict=True)]
 
     def score(
         self, splats: Splats, views: Sequence[TrainView], sh_degree: int, level: int = LEVEL,
