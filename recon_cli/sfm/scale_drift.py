@@ -339,15 +339,15 @@ class Observations:
         by_local = by_local @ frames
         turn = np.cross(local[:, None], np.eye(3)[None]).transpose(0, 2, 1)
         by_point = by_local @ rotations
-        errors = focal * (found - places)
-        sizes = np.linalg.norm(errors, axis=1)
-        scale = LOSS_SCALE * max(float(sizes.mean()), 1e-9)
-        weights = 1 / (1 + (sizes / scale) ** 2)
+        has_ray = np.isfinite(places).all(axis=1)  # a bent lens has none for some pixels
+        sizes = np.linalg.norm(np.where(has_ray[:, None], focal * (found - places), 0), axis=1)
+        scale = LOSS_SCALE * max(float(sizes.sum() / max(has_ray.sum(), 1)), 1e-9)
+        weights = has_ray / (1 + (sizes / scale) ** 2)
         root = np.sqrt(weights)[:, None, None]
         self.by_camera = root * np.concatenate([-by_local @ turn, -by_point], axis=2)
         self.by_point = root * by_point
         self.by_lens = -root * focal[:, :, None] * self.by_lens
-        free = 2 * len(rays) - POSE * len(self.centers) - 3 * self.points
+        free = 2 * int(has_ray.sum()) - POSE * len(self.centers) - 3 * self.points
         self.variance = float(weights @ sizes**2) / max(free, 1)  # pixels squared
 
 

@@ -96,6 +96,19 @@ def test_photos_without_an_order_are_cut_where_few_points_tie_them():
     assert is_scale_known(weakest(halves(near(300), count=14), ordered=False))
 
 
+def test_pixels_that_a_bent_lens_has_no_direction_for_say_nothing():
+    """COLMAP 4.2: what lies beyond the radius where the distortion turns back has no ray, NaN."""
+    made = halves(near(300), count=14)
+    model = made.model()
+    corner = np.hypot(WIDTH, HEIGHT) / 2 / FOCAL
+    camera = model.camera(1)
+    camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+    camera.params = [FOCAL, WIDTH / 2, HEIGHT / 2, -4 / 27 / (0.9 * corner) ** 2]
+    assert np.isnan(camera.cam_from_img(np.array([[0.5, 0.5]]))).all()
+    model.update_point_3d_errors()
+    assert np.isfinite(weakest(made, model=model, ordered=False).error)
+
+
 @pytest.mark.parametrize("ordered", [False, True])
 def test_a_side_that_collapsed_is_measured_by_itself(ordered):
     """One half shrinks with all that it alone sees; the distance is as it was."""
