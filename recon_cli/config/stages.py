@@ -204,12 +204,12 @@ class TrainConfig(StageConfig):
     max_gaussians: int | None = option(
         None, "Maximum number of Gaussians.", minimum=MIN_GAUSSIANS,
         automatic="auto, by image detail, steps and memory")
-    early_stop: bool = option(True, "Skip to the final phase once validation PSNR stops improving.")
+    early_stop: bool = option(True, "Finish once validation PSNR stays.")
     images: str = option(
         "auto", "Pixels to use; auto: by a trial.",
         choices=("auto", "denoised", "original"))
     background: str = option(
-        "auto", "Add background Gaussians where there are no sparse points; auto: by a trial.",
+        "auto", "Add a background; auto: by trial.",
         choices=("auto", "on", "off"), plain="off", formerly="far")
     stereo: str = option(
         "auto", "Start with Gaussians on surfaces that dense stereo finds and sparse points leave "

@@ -37,6 +37,7 @@ _EYES = ("left", "right")
 _OK = ("pose_ok", "get_texture_ok", "get_colors_ok")
 _POSITION, _TURN = "pose_pos_{}", "pose_rot_{}"
 _ASKED = 60  # frames that the order of depth is found from
+_HINT = "Copy the recording from the headset again."
 
 
 def is_quest(folder: Path) -> bool:
@@ -150,7 +151,7 @@ def read_rgba(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
+        raise InputError(f"{path} cannot be read: {error}.", hint=_HINT) from error
     if data.size != width * height * 4:
-        raise InputError(f"{path} does not hold {width}x{height} pixels.")
+        raise InputError(f"{path} does not hold {width}x{height} pixels.", hint=_HINT)
     return np.ascontiguousarray(data.reshape(height, width, 4)[::-1, :, :3])
