@@ -84,8 +84,12 @@ def raising(*, restore: bool = True) -> Iterator[None]:
     them back their default action, and with it another exit code to a command that is done.
     """
     global _watch
-    if _watch is not None or threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield
+        return
+    if _watch is not None:
+        with _naming_the_signal(_watch):
+            yield
         return
     _watch = _Watch()
     before = {number: signal.getsignal(number) for number in NUMBERS}
@@ -94,11 +98,23 @@ def raising(*, restore: bool = True) -> Iterator[None]:
     for number in before:
         signal.signal(number, _watch.handle)
     try:
-        yield
+        with _naming_the_signal(_watch):
+            yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if restore else signal.SIG_IGN)
         _watch = None
+
+
+@contextmanager
+def _naming_the_signal(watch: _Watch) -> Iterator[None]:
+    """Raises Interrupted in place of what a native module says that a signal met in its import."""
+    try:
+        yield
+    except (ImportError, SystemError) as error:
+        if not watch.number or watch.deferred:
+            raise
+        raise Interrupted(watch.number) from error
 
 
 @contextmanager

@@ -53,6 +53,18 @@ def test_a_signal_at_the_very_end_does_not_change_the_exit_code(number):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_a_native_module_whose_import_takes_a_signal_does_not_hide_it():
+    """Seen with modules by pybind11: "ImportError: initialization failed" in its place."""
+    with pytest.raises(Interrupted) as caught, raising():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except Interrupted as error:
+            raise ImportError("initialization failed") from error
+    assert caught.value.number == signal.SIGTERM
+    with pytest.raises(ImportError), raising():
+        raise ImportError("no such module")
+
+
 def test_a_signal_that_is_sent_twice_at_once_counts_once():
     done = []
 

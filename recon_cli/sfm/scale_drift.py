@@ -50,6 +50,9 @@ MAX_SCALE_INTERVAL = 0.15
 # likely off by 10% than by what is fine.
 MIN_SURE_EXPLAINED = 0.85
 MAX_FLOOR_STEP = (MAX_SCALE_ERROR + 0.1) / 2
+# Cameras that lie nearer to each other than this share of a reach are at one place: centres have a
+# precision of some 1e-12 of it, and what is known of a scale is divided by the distance.
+COINCIDENT = 1e-6
 DOUBTFUL = MAX_SCALE_ERROR / 3  # the floor is looked at from here on
 _RIDGE = 1e-10  # times the diagonal: position, turn and scale of the model are free
 POSE = 6  # unknowns of a camera: its turn, and its centre
@@ -167,6 +170,8 @@ def _graph_cuts(information: _Information, shared: view_graph.Weights) -> Iterat
             len(ours), len(theirs)))
         both = np.append(ours, theirs[other])
         share = information.reached(both, theirs)
+        if share < COINCIDENT:  # the same photo twice: no scale, and rounding errors in its place
+            continue
         yield _Cut(min(1.0, share) * information.error(theirs, both), side, (ours, theirs),
                    (int(ours[end]), int(theirs[other])))
 

@@ -96,6 +96,13 @@ def test_photos_without_an_order_are_cut_where_few_points_tie_them():
     assert is_scale_known(weakest(halves(near(300), count=14), ordered=False))
 
 
+def test_photos_given_twice_have_no_scale_of_their_own():
+    twice = np.repeat(np.arange(8) * 0.5, 2) + np.tile([0, 1e-14], 8)
+    made = NoisyModel(wall(-3, 6, count=600), along(twice))
+    cut = weakest(made, ordered=False)
+    assert cut.error < MAX_SCALE_ERROR
+
+
 def test_pixels_that_a_bent_lens_has_no_direction_for_say_nothing():
     """COLMAP 4.2: what lies beyond the radius where the distortion turns back has no ray, NaN."""
     made = halves(near(300), count=14)
