@@ -55,11 +55,14 @@ def test_a_signal_at_the_very_end_does_not_change_the_exit_code(number):
 
 def test_a_native_module_whose_import_takes_a_signal_does_not_hide_it():
     """Seen with modules by pybind11: "ImportError: initialization failed" in its place."""
-    with pytest.raises(Interrupted) as caught, raising():
+    def start():
         try:
             signal.raise_signal(signal.SIGTERM)
         except Interrupted as error:
             raise ImportError("initialization failed") from error
+
+    with pytest.raises(Interrupted) as caught, raising():
+        start()
     assert caught.value.number == signal.SIGTERM
     with pytest.raises(ImportError), raising():
         raise ImportError("no such module")
