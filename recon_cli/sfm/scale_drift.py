@@ -345,7 +345,7 @@ class Observations:
         turn = np.cross(local[:, None], np.eye(3)[None]).transpose(0, 2, 1)
         by_point = by_local @ rotations
         # a bent lens has no ray for some pixels
-        has_ray: NDArray[np.bool_] = np.isfinite(places).all(axis=1)
+        has_ray = np.asarray(np.isfinite(places).all(axis=1))
         sizes = np.linalg.norm(np.where(has_ray[:, None], focal * (found - places), 0), axis=1)
         scale = LOSS_SCALE * max(float(sizes.sum() / max(has_ray.sum(), 1)), 1e-9)
         weights = has_ray / (1 + (sizes / scale) ** 2)
