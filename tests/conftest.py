@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from browser import WatchedPage
     from playwright.sync_api import Browser
 
-    from recon_cli.sfm.xfeat import Network
+    from recon_cli.sfm.features.xfeat import Network
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels are kept from one run of the tests to the next, but not among the user's own.
@@ -132,7 +132,7 @@ def learned_weights(build_once: Callable[[str, Callable[[Path], object]], Path])
 @pytest.fixture
 def learned_network(learned_weights: Path, monkeypatch: pytest.MonkeyPatch) -> Network:
     """XFeat with these weights."""
-    from recon_cli.sfm import xfeat, xfeat_weights
+    from recon_cli.sfm.features import xfeat, xfeat_weights
 
     monkeypatch.setenv("RECON_CACHE_DIR", str(learned_weights))
     weights = xfeat_weights.load_weights()

@@ -25,7 +25,7 @@ from recon_cli import processes, signals
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError, ExitCode
 from recon_cli.pipeline.batch import name_captures
-from recon_cli.train.state import load_state, new_state, save_state
+from recon_cli.train.fit.state import load_state, new_state, save_state
 from recon_cli.viewer import server
 from recon_cli.workspace import atomic, disk, durable, journal, layout
 

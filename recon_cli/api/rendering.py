@@ -22,7 +22,7 @@ from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.importance import Importance, add_views
+from recon_cli.train.fit.importance import Importance, add_views
 
 
 @dataclass(frozen=True, eq=False)

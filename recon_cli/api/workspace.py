@@ -197,8 +197,8 @@ class Workspace:
         """
         from recon_cli.io.training_scene import load_scene
         from recon_cli.io.views import load_views
+        from recon_cli.train.fit.train_data import read_config
         from recon_cli.train.plan import QUALITIES
-        from recon_cli.train.train_data import read_config
 
         if split not in ("train", "validation", "test"):
             raise InputError(f"There is no split {split!r}.",

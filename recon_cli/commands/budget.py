@@ -21,7 +21,7 @@ from recon_cli.config.settings import Settings, build, merge
 from recon_cli.config.stages import IngestConfig, TrainConfig
 from recon_cli.deadline import Clock, Deadline
 from recon_cli.errors import ReconError
-from recon_cli.sfm.time_estimate import Workload, expected_seconds, measure_slowness
+from recon_cli.sfm.mapping.time_estimate import Workload, expected_seconds, measure_slowness
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import IngestSummary, JsonRecord, TrainSummary
@@ -169,7 +169,7 @@ def _report_frames(
 def _pruning_seconds(workspace: Workspace) -> float:
     """Returns about how long the pruning of a finished model takes, by the steps of its training.
     """
-    from recon_cli.train.prune_run import count_recovery_steps  # imports torch
+    from recon_cli.train.prune.prune_run import count_recovery_steps  # imports torch
 
     manifest = workspace.manifest("train")
     assert manifest is not None

@@ -23,8 +23,8 @@ from recon_cli.pipeline import execute, plan
 from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.plan import Target
 from recon_cli.stages import stage
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.plan import QUALITIES
-from recon_cli.train.train_data import read_config
 from recon_cli.workspace.layout import Workspace
 
 

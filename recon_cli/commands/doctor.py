@@ -55,7 +55,7 @@ def examine(workspace: Path) -> Findings:
     import torch
 
     from recon_cli.render import registry
-    from recon_cli.sfm import xfeat_weights
+    from recon_cli.sfm.features import xfeat_weights
 
     cuda = torch.cuda
     root = workspace.absolute()

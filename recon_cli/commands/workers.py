@@ -17,7 +17,7 @@ from recon_cli.progress import NullProgress
 @click.argument("job", type=options.PathType(exists=True, dir_okay=False))
 def map_segment(job: Path) -> None:
     """Map one segment of a capture, as JOB says."""
-    from recon_cli.sfm import segments
+    from recon_cli.sfm.segments import segments
 
     segments.map_segment(job)
 
@@ -29,7 +29,7 @@ def map_segment(job: Path) -> None:
 def train_block(call: Call, job: Path) -> None:
     """Train one block of a scene, as JOB says."""
     from recon_cli.pipeline.execute import render_context
-    from recon_cli.train import blocks
+    from recon_cli.train.blocks import blocks
 
     blocks.train_block(
         job, render_context(settings.build(ComputeConfig, call.settings), NullProgress()))

@@ -35,8 +35,8 @@ from recon_cli.render import registry
 from recon_cli.render.contract import Renderer, RenderOutput, StepOptions
 from recon_cli.render.torch import tiles
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.fit.gradient import gradient_step
+from recon_cli.train.fit.optimizer import SplatOptimizer
 from recon_cli.workspace import atomic
 
 SCHEMA = "recon-bench"

@@ -32,14 +32,14 @@ from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import stage
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state
+from recon_cli.train.fit.initialize import first_state
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import RecoverySchedule
+from recon_cli.train.fit.state import TrainState
+from recon_cli.train.fit.task import Task
 from recon_cli.train.parts.table import model_parts
 from recon_cli.train.plan import first_count
-from recon_cli.train.prune_loop import RATIO, PruneRun, prune_loop, remaining, rounds_within
-from recon_cli.train.schedule import RecoverySchedule
-from recon_cli.train.state import TrainState
-from recon_cli.train.task import Task
+from recon_cli.train.prune.prune_loop import RATIO, PruneRun, prune_loop, remaining, rounds_within
 from recon_cli.workspace.atomic import parse_json, write_bytes
 from recon_cli.workspace.digests import sha256_json
 

@@ -23,11 +23,11 @@ from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.progress import Progress
 from recon_cli.scene.scene import Scene
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.task import Task
+from recon_cli.train.fit.train_data import load_task
 from recon_cli.train.parts.table import PARTS, model_parts
 from recon_cli.train.plan import choose_parts
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.task import Task
-from recon_cli.train.train_data import load_task
 from recon_cli.workspace.digests import digest_file, sha256_json
 from recon_cli.workspace.layout import Workspace
 

@@ -20,7 +20,7 @@ from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, Splats
-from recon_cli.train.importance import Importance, add_views
+from recon_cli.train.fit.importance import Importance, add_views
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.summaries import ExportChange
 
@@ -100,7 +100,7 @@ class _HighestScores:
 
     def take(self, scene: Splats, count: int) -> Splats:
         """Returns as many of the scene, which may be in another degree."""
-        from recon_cli.train.prune_loop import survivors  # imports the whole training
+        from recon_cli.train.prune.prune_loop import survivors  # imports the whole training
 
         return scene.select(survivors(self._score, count))
 

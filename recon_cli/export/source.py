@@ -26,7 +26,7 @@ from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.format import Guide, WriteSettings
-from recon_cli.train.train_data import load_views, read_config
+from recon_cli.train.fit.train_data import load_views, read_config
 from recon_cli.workspace.records import (
     POSES,
     ImportRecord,

@@ -8,7 +8,7 @@ from recon_cli.context import StageContext
 from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.flythrough.trained_scene import TrainedScene
 from recon_cli.pipeline.execute import Job
-from recon_cli.train.train_data import read_config
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.trust.scene_trust import Trust, measure_trust, refuse_without, views_looked_at
 from recon_cli.workspace.records import ImportRecord
 

@@ -19,7 +19,7 @@ from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import read_ply
-from recon_cli.train.train_data import read_config
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.trust.scene_trust import digest_of
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord

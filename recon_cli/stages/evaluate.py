@@ -57,12 +57,12 @@ from recon_cli.io.views import ReferenceView, evenly_spread, size_summary, sizes
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
+from recon_cli.train.fit.runner import LOG, seconds_at
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.masks import read_summary, with_masks
 from recon_cli.train.parts.moving import FINER, ViewComparer, find_in_held_out
 from recon_cli.train.parts.moving_regions import SIDE
 from recon_cli.train.parts.photometry import read_falloffs
-from recon_cli.train.runner import LOG, seconds_at
-from recon_cli.train.train_data import read_config
 from recon_cli.trust.assess import TrustTask, assess
 from recon_cli.workspace.atomic import write_json, write_text
 from recon_cli.workspace.records import Frame, ImportRecord, describe_stretches, read_frame_list

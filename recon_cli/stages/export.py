@@ -28,7 +28,7 @@ from recon_cli.scene.splats import Splats, transformed
 from recon_cli.splats.axes import nearest_up
 from recon_cli.splats.ply import describe_scene, read_ply, write_ply
 from recon_cli.train.finished_model import FINAL
-from recon_cli.train.train_data import read_config
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.trust.ply_property import PLY_PROPERTY, expected_errors, match_rows
 from recon_cli.trust.scene_trust import measure_trust, refuse_without, views_looked_at
 from recon_cli.workspace.atomic import write_json

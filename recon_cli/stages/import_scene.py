@@ -22,7 +22,7 @@ from recon_cli.splats.axes import AXES
 from recon_cli.splats.format import LoadedScene
 from recon_cli.splats.ply import write_ply
 from recon_cli.splats.registry import format_of, load_splats
-from recon_cli.train.train_data import write_config
+from recon_cli.train.fit.train_data import write_config
 from recon_cli.workspace.digests import digest_file
 from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import ImportSummary

@@ -19,7 +19,7 @@ from recon_cli.datasets import from_data_set
 from recon_cli.datasets.layouts import recognise, refuse_incomplete
 from recon_cli.errors import InputError, format_count
 from recon_cli.io.tracks import TRACKS
-from recon_cli.sfm.segments import MOST_UNSPLIT
+from recon_cli.sfm.segments.segments import MOST_UNSPLIT
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import FrameList, Group
 from recon_cli.workspace.summaries import IngestSummary

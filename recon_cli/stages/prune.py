@@ -13,11 +13,11 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, TrainingError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import max_gaussians, write_ply
-from recon_cli.train.fit import validation_psnr
+from recon_cli.train.fit.loop import validation_psnr
+from recon_cli.train.fit.runner import LOG, seconds_at
 from recon_cli.train.parts.photometry import write_photometry
-from recon_cli.train.prune_loop import RATIO, prune_loop, remaining
-from recon_cli.train.prune_run import StoredPruneRun, load_prune_source, prune_while_good
-from recon_cli.train.runner import LOG, seconds_at
+from recon_cli.train.prune.prune_loop import RATIO, prune_loop, remaining
+from recon_cli.train.prune.prune_run import StoredPruneRun, load_prune_source, prune_while_good
 from recon_cli.workspace.summaries import PruneSummary, RoundSummary
 
 

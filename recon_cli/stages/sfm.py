@@ -16,11 +16,13 @@ from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.jobs.executor import Executor, start_executor
 from recon_cli.room.scale import parse_place
 from recon_cli.scene.camera import MODELS, PANORAMA
-from recon_cli.sfm import database, parts, process, segments
+from recon_cli.sfm import database
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.mapping import parts, process
+from recon_cli.sfm.mapping.time_estimate import Workload, estimate_for_notice, format_minutes
+from recon_cli.sfm.mapping.trusted_part import JOIN_PANORAMAS
 from recon_cli.sfm.results import MappingResult
-from recon_cli.sfm.time_estimate import Workload, estimate_for_notice, format_minutes
-from recon_cli.sfm.trusted_part import JOIN_PANORAMAS
+from recon_cli.sfm.segments import segments
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import (
     POSES,

@@ -18,7 +18,8 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, format_count, list_names
 from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.scene import Scene
-from recon_cli.train import blocks
+from recon_cli.train.blocks import blocks
+from recon_cli.train.blocks.merge_blocks import merge_blocks
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.masks import (
     EditedMasks,
@@ -28,7 +29,6 @@ from recon_cli.train.masks import (
     with_masks,
     write_masks,
 )
-from recon_cli.train.merge_blocks import merge_blocks
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace.records import Frame, read_frame_list
 from recon_cli.workspace.summaries import TrainSummary

@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from recon_cli.context import TrainCallback
 from recon_cli.deadline import Clock, Deadline
 from recon_cli.scene.splats import Splats
-from recon_cli.train import densification
-from recon_cli.train.fit import fit, report_every, validation_psnr
-from recon_cli.train.initialize import splats_from_points
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import (
+from recon_cli.train.fit import densification
+from recon_cli.train.fit.initialize import splats_from_points
+from recon_cli.train.fit.loop import fit, report_every, validation_psnr
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.state import (
     LONG_SAVE,
     SAVE_SHARE,
     TrainState,
     new_state,
     save_state,
 )
-from recon_cli.train.task import Task
+from recon_cli.train.fit.task import Task
 from recon_cli.workspace.atomic import delete
 
 # Of Gaussians that stand for trained ones: with .3 a step takes what a real one does within 10%,

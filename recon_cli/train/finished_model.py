@@ -19,13 +19,13 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
 from recon_cli.scene.splats import with_rows
 from recon_cli.splats.ply import read_ply
-from recon_cli.train.initialize import begin_state, restore_state
+from recon_cli.train.fit.initialize import begin_state, restore_state
+from recon_cli.train.fit.runner import LOG
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.state import DensificationStats, TrainState, read_progress
+from recon_cli.train.fit.task import Task
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.parts.table import PARTS, model_parts
-from recon_cli.train.runner import LOG
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import DensificationStats, TrainState, read_progress
-from recon_cli.train.task import Task
-from recon_cli.train.train_data import read_config
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import LogRow, TrainPlan, TrialDecision

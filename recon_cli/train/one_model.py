@@ -12,13 +12,13 @@ from recon_cli.io.views import size_summary
 from recon_cli.scene.scene import Scene
 from recon_cli.splats.ply import write_ply
 from recon_cli.train.finished_model import FinishedModel
+from recon_cli.train.fit.runner import CHECKPOINT, LOG, Segment, run_fit
+from recon_cli.train.fit.state import TrainState, save_state
+from recon_cli.train.fit.task import Task
 from recon_cli.train.masks import EditedMasks, read_summary
 from recon_cli.train.parts.photometry import write_photometry
 from recon_cli.train.parts.table import model_parts
 from recon_cli.train.plan import first_or_saved, plan_task
-from recon_cli.train.runner import CHECKPOINT, LOG, Segment, run_fit
-from recon_cli.train.state import TrainState, save_state
-from recon_cli.train.task import Task
 from recon_cli.workspace.atomic import delete
 from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import LogRow, PhotometrySummary, TrainPlan, TrainSummary

@@ -26,15 +26,11 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.cost import CostModel, calibrate
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.initialize import first_state, restore_state
-from recon_cli.train.masks import EditedMasks, copy_masks, with_masks, write_masks
-from recon_cli.train.parts.part import TrialScene
-from recon_cli.train.parts.table import PARTS, model_parts
-from recon_cli.train.parts.trials import Needs, examine
-from recon_cli.train.schedule import RECIPES, Schedule, make_schedule
-from recon_cli.train.state import TrainState
-from recon_cli.train.task import Task
-from recon_cli.train.train_data import (
+from recon_cli.train.fit.initialize import first_state, restore_state
+from recon_cli.train.fit.schedule import RECIPES, Schedule, make_schedule
+from recon_cli.train.fit.state import TrainState
+from recon_cli.train.fit.task import Task
+from recon_cli.train.fit.train_data import (
     gaussians_that_fit,
     image_file,
     load_task,
@@ -42,6 +38,10 @@ from recon_cli.train.train_data import (
     read_config,
     write_config,
 )
+from recon_cli.train.masks import EditedMasks, copy_masks, with_masks, write_masks
+from recon_cli.train.parts.part import TrialScene
+from recon_cli.train.parts.table import PARTS, model_parts
+from recon_cli.train.parts.trials import Needs, examine
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import TrainPlan
 

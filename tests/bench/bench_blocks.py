@@ -30,7 +30,7 @@ from recon_cli.evaluation.reference_views import load_reference_views, score_vie
 from recon_cli.io.views import ReferenceView
 from recon_cli.scene.cells import Cell
 from recon_cli.splats.ply import read_ply
-from recon_cli.train.blocks import cut_blocks
+from recon_cli.train.blocks.blocks import cut_blocks
 
 PLACES = 500  # that are drawn around a camera
 SEED = 0

@@ -34,10 +34,11 @@ from verdict_captures import quiet
 from workbench import FOLDER, print_head, print_row
 
 from recon_cli.errors import ReconError
-from recon_cli.sfm import bridge, features, matching, worker, xfeat_weights
+from recon_cli.sfm.features import bridge, features, matching, xfeat_weights
+from recon_cli.sfm.features.xfeat import Network
 from recon_cli.sfm.job import CameraGroup, MappingJob
 from recon_cli.sfm.limits import FEW_PAIR_MATCHES
-from recon_cli.sfm.xfeat import Network
+from recon_cli.sfm.mapping import worker
 
 NEAR_PX, MIN_TRUE = 6.0, 0.5  # of a match by the reference, and the share that a true pair has
 Array = NDArray[np.float64]

@@ -36,7 +36,7 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import SH_C0, Splats, joined
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.train_data import load_views
+from recon_cli.train.fit.train_data import load_views
 
 PLANTED = 60
 

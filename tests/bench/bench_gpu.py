@@ -43,10 +43,10 @@ from recon_cli.render.contract import NEAR
 from recon_cli.render.triton import step as triton_step
 from recon_cli.render.triton.step_status import StepReport
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train import stepper
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import TrainState, new_state
-from recon_cli.train.task import Task
+from recon_cli.train.fit import stepper
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.state import TrainState, new_state
+from recon_cli.train.fit.task import Task
 from recon_cli.workspace import atomic
 
 _SMALL = 8  # the part of Gaussians and of each side in the first checks, which are soon over

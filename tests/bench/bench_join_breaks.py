@@ -26,13 +26,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from workbench import FOLDER
 
-from recon_cli.sfm.join_segments import MODEL_FOLDER
 from recon_cli.sfm.limits import MAX_POINT_ERROR
-from recon_cli.sfm.segment_joins import (
+from recon_cli.sfm.segments.join_segments import MODEL_FOLDER
+from recon_cli.sfm.segments.segment_joins import (
     camera_residuals,
     judge_join,
 )
-from recon_cli.sfm.shared_points import Segment, SegmentCameras, SharedPoints, describe_segment
+from recon_cli.sfm.segments.shared_points import (
+    Segment,
+    SegmentCameras,
+    SharedPoints,
+    describe_segment,
+)
 
 BREAKS = {"as it is": (1.0, 0.0), "x 0.8": (0.8, 0.0), "x 0.9": (0.9, 0.0), "x 1.1": (1.1, 0.0),
           "x 1.25": (1.25, 0.0), "x 1.5": (1.5, 0.0), "5 degrees": (1.0, 5.0),

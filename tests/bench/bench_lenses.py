@@ -2,8 +2,8 @@
 of a COLMAP model alone.
 
 A row a camera: the error in pixels of points that an adjustment did not see, with each camera model
-in place of that of the finished model (`recon_cli.sfm.lens_trial`), and the share of the error that
-it takes away from OPENCV's, with its standard error. Then the matches that a fisheye explains, in
+A row a camera: the error in pixels of points that an adjustment did not see, with each camera model
+in place of that of the finished model (`sfm.mapping.lens_trial`), and the share of the error that
 shares of those that an ordinary lens without distortion does, where there is a database: by that
 sfm chooses between the two before it maps.
 """
@@ -20,8 +20,8 @@ import click
 import pycolmap
 from workbench import print_head, print_row
 
-from recon_cli.sfm import lens_trial, wide_lens
 from recon_cli.sfm.job import CameraGroup, MappingJob
+from recon_cli.sfm.mapping import lens_trial, wide_lens
 
 MODELS = (*lens_trial.MODELS, "FULL_OPENCV")
 REFERENCE = "OPENCV"

@@ -23,9 +23,9 @@ from workbench import mapping_job, print_head, print_row, read_json
 
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob, Reporter
-from recon_cli.sfm.mapper import model_size
+from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.mapping.mapper import model_size
 
 HEADINGS = ("capture", "mapper", "registered", "models", "points", "reprojection px",
             "centre median / max", "compared with", "CPU s")

@@ -19,11 +19,11 @@ import workbench
 from recon_cli.config.stages import TrainConfig
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
+from recon_cli.train.fit.train_data import load_task
 from recon_cli.train.parts.moving import ViewComparer, find_detections, have_evidence, preview_rows
 from recon_cli.train.parts.part import TrialScene
 from recon_cli.train.parts.trials import Trials
 from recon_cli.train.plan import first_config
-from recon_cli.train.train_data import load_task
 
 _SIZE, _LEVEL = 300, 2  # pixels of the views, and what the trial reduces them by
 

@@ -42,9 +42,9 @@ from recon_cli.io.images import fit_camera, read_image
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.fit.task import Task
+from recon_cli.train.fit.train_data import load_task
 from recon_cli.train.plan import Facts, count_detail, useful_cap
-from recon_cli.train.task import Task
-from recon_cli.train.train_data import load_task
 
 ROOMS = Path(__file__).resolve().parents[3] / "shared" / "data" / "rooms"
 RUN, SHARE, LEAST_RUNS = 5, 0.1, 2  # views of a stretch, share of all views, stretches

@@ -32,11 +32,11 @@ from recon_cli.experiments.scenes import (
 from recon_cli.experiments.variants import REFERENCE, MidPrune, TrainingRun
 from recon_cli.pipeline.execute import render_context
 from recon_cli.progress import NullProgress
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state, restore_state
+from recon_cli.train.fit.initialize import first_state, restore_state
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.state import save_state
 from recon_cli.train.plan import first_count
-from recon_cli.train.prune_loop import prune_loop, remaining
-from recon_cli.train.state import save_state
+from recon_cli.train.prune.prune_loop import prune_loop, remaining
 
 THIRD = 1 / 3
 

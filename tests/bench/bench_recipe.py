@@ -39,11 +39,11 @@ from recon_cli.experiments.runner import score_as_ply
 from recon_cli.io.colmap import read_visibility
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene
+from recon_cli.train.fit.schedule import RECIPES, Recipe, Schedule
+from recon_cli.train.fit.state import TrainState
+from recon_cli.train.fit.task import Evidence, Task
+from recon_cli.train.fit.train_data import load_task
 from recon_cli.train.plan import Facts, count_detail, useful_cap
-from recon_cli.train.schedule import RECIPES, Recipe, Schedule
-from recon_cli.train.state import TrainState
-from recon_cli.train.task import Evidence, Task
-from recon_cli.train.train_data import load_task
 
 WARM = 20  # steps that load what is compiled
 SHOWN = 20  # training views that are scored, at most

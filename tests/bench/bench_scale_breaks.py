@@ -38,11 +38,11 @@ from verdict_captures import CAPTURES, MODEL, Capture, prepare
 from verdict_variants import ordered_poses
 from workbench import FOLDER, print_head, print_row
 
-from recon_cli.sfm import mapper
-from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.job import MappingJob
-from recon_cli.sfm.merge_models import build_posed_model, drop_outliers
-from recon_cli.sfm.scale_drift import (
+from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.mapping.merge_models import build_posed_model, drop_outliers
+from recon_cli.sfm.verdict.evidence import gather_evidence
+from recon_cli.sfm.verdict.scale_drift import (
     MAX_FLOOR_STEP,
     MAX_SCALE_ERROR,
     MAX_SCALE_INTERVAL,
@@ -51,7 +51,7 @@ from recon_cli.sfm.scale_drift import (
     find_weakest_scale,
     is_scale_known,
 )
-from recon_cli.sfm.verdict import ModelVerdict, examine, find_order
+from recon_cli.sfm.verdict.verdict import ModelVerdict, examine, find_order
 
 FACTORS = (1.03, 1.10, 1.30)
 DRIFTS = (1.02, 1.05, 1.10)  # from the first frame of a walk to the last

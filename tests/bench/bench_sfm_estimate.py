@@ -3,8 +3,8 @@
     python tests/bench/bench_sfm_estimate.py WORKSPACE... [--fit]
 
 Nothing is run: manifests record the CPU seconds of each step. Those of all steps together are told
-from the frames, their size, tracks and segments, by the costs in `sfm/time_estimate.py`; the
-seconds on two idle cores follow from the same costs. A row that needed a later mapper is marked:
+from the frames, their size, tracks and segments, by the costs in
+`sfm/mapping/time_estimate.py`; the seconds on two idle cores follow from the same costs. A row that needed a later mapper is marked:
 that the first falls short cannot be known before. --fit prints costs that fit the rows that are
 not marked, in relative least squares with none below zero; one that no row pays keeps its value.
 
@@ -25,8 +25,8 @@ from workbench import print_head, print_row, read_json, workspaces_argument
 
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.io.tracks import TRACKS, Tracks
-from recon_cli.sfm.keyframes import choose_keyframes
-from recon_cli.sfm.time_estimate import COSTS, Costs, Workload, expected_seconds, list_work
+from recon_cli.sfm.features.keyframes import choose_keyframes
+from recon_cli.sfm.mapping.time_estimate import COSTS, Costs, Workload, expected_seconds, list_work
 from recon_cli.workspace.records import read_frame_list
 from recon_cli.workspace.summaries import SfmSummary
 

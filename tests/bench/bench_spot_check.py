@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from workbench import mapping_job, workspace_argument
 
-from recon_cli.sfm import known_poses
+from recon_cli.sfm.poses import known_poses
 from recon_cli.workspace.records import POSES, read_poses
 
 Poses = dict[str, NDArray[np.float64]]  # [4, 4] world to camera by name

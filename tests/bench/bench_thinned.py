@@ -37,11 +37,12 @@ from recon_cli.errors import ReconError
 from recon_cli.io.colmap_library import write_model
 from recon_cli.io.tracks import TRACKS
 from recon_cli.progress import NullProgress
-from recon_cli.sfm import fallbacks, trusted_part, worker, xfeat_weights
-from recon_cli.sfm.camera_covariance import measure_rms
+from recon_cli.sfm.features import xfeat_weights
 from recon_cli.sfm.job import MappingJob
-from recon_cli.sfm.merge_models import ModelCandidate
-from recon_cli.sfm.verdict import ModelVerdict, examine
+from recon_cli.sfm.mapping import fallbacks, trusted_part, worker
+from recon_cli.sfm.mapping.merge_models import ModelCandidate
+from recon_cli.sfm.verdict.camera_covariance import measure_rms
+from recon_cli.sfm.verdict.verdict import ModelVerdict, examine
 from recon_cli.stages import ingest
 from recon_cli.stages.sfm import _times
 from recon_cli.workspace import records

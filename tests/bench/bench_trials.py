@@ -35,11 +35,11 @@ from recon_cli.context import StageContext
 from recon_cli.evaluation.metrics import corrected_psnr, psnr
 from recon_cli.evaluation.reference_views import render_view
 from recon_cli.scene.scene import Scene
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.task import Task
+from recon_cli.train.fit.train_data import load_task, load_views
 from recon_cli.train.parts.sparse_points import estimate_gains
 from recon_cli.train.plan import Facts, cap, choose_parts, count_detail, first_config
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.task import Task
-from recon_cli.train.train_data import load_task, load_views
 
 VALIDATION = 0.2  # share of the training views: as many views as trials hold out by themselves
 DEGREE = "sh-degree"

@@ -24,7 +24,7 @@ from workbench import numba_context, open_trained, print_head, print_row, worksp
 from recon_cli.evaluation.reference_views import RenderedModel, load_reference_views
 from recon_cli.io.views import ReferenceView
 from recon_cli.machine import usable_threads
-from recon_cli.train.runner import LOG, seconds_at
+from recon_cli.train.fit.runner import LOG, seconds_at
 from recon_cli.trust.agreement import ause
 from recon_cli.trust.error_model import picture_terms
 from recon_cli.trust.scene_trust import Trust, measure_trust, model_trust

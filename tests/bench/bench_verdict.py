@@ -31,10 +31,10 @@ from verdict_captures import CAPTURES, MODEL, ROOMS, Capture, prepare, quiet
 from verdict_variants import BROKEN, GOOD, Variant, make, ordered_poses
 from workbench import FOLDER
 
-from recon_cli.sfm import mapper
 from recon_cli.sfm.job import MappingJob
-from recon_cli.sfm.merge_models import drop_outliers
-from recon_cli.sfm.verdict import ModelVerdict, is_aliased, is_broken
+from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.mapping.merge_models import drop_outliers
+from recon_cli.sfm.verdict.verdict import ModelVerdict, is_aliased, is_broken
 
 SOUND = 0.02  # of the extent: no camera of a good model is further off
 DISPLACED = 0.05  # of the extent: a model with a camera further off is broken

@@ -29,10 +29,10 @@ from recon_cli.machine import usable_threads
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state
-from recon_cli.train.schedule import make_schedule
-from recon_cli.train.train_data import load_task, load_views
+from recon_cli.train.fit.initialize import first_state
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import make_schedule
+from recon_cli.train.fit.train_data import load_task, load_views
 from recon_cli.trust.error_model import PRIOR, TERMS, picture_terms
 from recon_cli.trust.scene_trust import measure_trust
 from recon_cli.trust.support import error_image

@@ -21,8 +21,9 @@ from workbench import mapping_job
 from recon_cli.config.stages import IngestConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.progress import NullProgress
-from recon_cli.sfm import features, mapper, matching
+from recon_cli.sfm.features import features, matching
 from recon_cli.sfm.job import CLIP_SECONDS, MappingJob, Reporter
+from recon_cli.sfm.mapping import mapper
 from recon_cli.stages import ingest
 from recon_cli.workspace import records
 

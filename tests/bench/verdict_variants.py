@@ -19,9 +19,10 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm import database, mapper
+from recon_cli.sfm import database
 from recon_cli.sfm.job import MappingJob
-from recon_cli.sfm.merge_models import build_posed_model
+from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.mapping.merge_models import build_posed_model
 
 REACH = 10  # neighbours that are matched where not all pairs are
 OVERLAP = 40  # points that two images share at least where a skeleton would match them

@@ -21,12 +21,12 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
 from recon_cli.sfm.job import CameraGroup, MappingJob
 from recon_cli.splats.ply import read_ply
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state
+from recon_cli.train.fit.initialize import first_state
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.state import TrainState
+from recon_cli.train.fit.task import Task
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.plan import first_count
-from recon_cli.train.state import TrainState
-from recon_cli.train.task import Task
-from recon_cli.train.train_data import read_config
 from recon_cli.workspace import records
 
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)

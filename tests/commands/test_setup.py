@@ -3,7 +3,7 @@ import pytest
 from recon_cli import cli
 from recon_cli.commands import doctor
 from recon_cli.errors import ExitCode
-from recon_cli.sfm import xfeat_weights
+from recon_cli.sfm.features import xfeat_weights
 
 
 @pytest.fixture(autouse=True)

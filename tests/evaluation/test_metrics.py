@@ -13,7 +13,7 @@ from recon_cli.evaluation.metrics import both_ssim, load_lpips, psnr, ssim
 from recon_cli.io.images import to_uint8
 from recon_cli.machine import install_command
 from recon_cli.scene.train_view import leaves_enough
-from recon_cli.train.gradient import photometric_loss
+from recon_cli.train.fit.gradient import photometric_loss
 
 pytestmark = pytest.mark.floors
 

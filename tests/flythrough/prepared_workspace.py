@@ -17,7 +17,7 @@ from recon_cli.pipeline.plan import Job, Target
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import write_ply
 from recon_cli.stages import STAGES
-from recon_cli.train.train_data import write_config
+from recon_cli.train.fit.train_data import write_config
 from recon_cli.workspace.layout import Workspace
 
 TABLE = tuple(replace(row, module="prepared_workspace", renders=False) for row in STAGES)

@@ -12,7 +12,7 @@ from recon_cli.render import render
 from recon_cli.render.contract import StepOptions, TargetImage
 from recon_cli.render.numba import backend
 from recon_cli.render.numba.step import PhotometricStep
-from recon_cli.train.gradient import photometric_loss
+from recon_cli.train.fit.gradient import photometric_loss
 
 BLACK = torch.zeros(3)
 MOST_BUFFERS = 60e6  # bytes, for 100,000 Gaussians at 640x360

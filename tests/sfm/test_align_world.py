@@ -15,8 +15,8 @@ from recon_cli.errors import ConfigError, SfmError
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.align_world import WorldFrame, refuse_contradiction, world_transform
-from recon_cli.sfm.shared_points import to_sim3d
+from recon_cli.sfm.poses.align_world import WorldFrame, refuse_contradiction, world_transform
+from recon_cli.sfm.segments.shared_points import to_sim3d
 
 
 def world_of(room, *, gravity=True, between=None, metric=False) -> WorldFrame:

@@ -8,10 +8,12 @@ import pytest
 from facts import assert_facts
 from synthetic import center_error, make_capture, part
 
-from recon_cli.sfm import bridge, database, fallbacks, mapper, matching, xfeat_weights
-from recon_cli.sfm.bridge import PhotoFeatures, find_bridge, match_rows, match_sift
+from recon_cli.sfm import database
+from recon_cli.sfm.features import bridge, matching, xfeat_weights
+from recon_cli.sfm.features.bridge import PhotoFeatures, find_bridge, match_rows, match_sift
+from recon_cli.sfm.features.xfeat import DESCRIPTOR_SIZE, DESCRIPTOR_STEPS, LearnedFeatures
 from recon_cli.sfm.job import Reporter, StepLog, parse
-from recon_cli.sfm.xfeat import DESCRIPTOR_SIZE, DESCRIPTOR_STEPS, LearnedFeatures
+from recon_cli.sfm.mapping import fallbacks, mapper
 
 NONE = np.zeros((0, 2), np.int64)
 FOCAL, WIDTH, HEIGHT = 500.0, 640, 480
@@ -375,7 +377,7 @@ def test_two_photos_are_bridged_by_the_network_itself(learned_network, tmp_path)
             seen = cv2.warpAffine(image, move, (640, 480), flags=cv2.INTER_LINEAR)
             photo = np.where(seen[:, :, 3:] > 127, seen[:, :, :3], photo)
         cv2.imwrite(str(job.frames / name), photo)
-    from recon_cli.sfm.features import extract_features
+    from recon_cli.sfm.features.features import extract_features
 
     matching.create_database(job)
     extract_features(job, Reporter(io.BytesIO()))

@@ -8,7 +8,7 @@ import pytest
 from made_model import MadeModel, moved
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm.camera_covariance import (
+from recon_cli.sfm.verdict.camera_covariance import (
     MAX_MODEL_ERROR,
     SHARED_ERRORS,
     describe_inexact,
@@ -16,7 +16,7 @@ from recon_cli.sfm.camera_covariance import (
     list_rough,
     measure_rms,
 )
-from recon_cli.sfm.verdict import examine
+from recon_cli.sfm.verdict.verdict import examine
 
 NOISE_PX = 0.5
 MANY = defaultdict(lambda: 100)  # points that a camera sees

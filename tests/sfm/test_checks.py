@@ -1,7 +1,7 @@
 import pytest
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import checks
+from recon_cli.sfm.mapping import checks
 
 NAMES = [f"{index:06d}.png" for index in range(20)]
 

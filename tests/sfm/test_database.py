@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from recon_cli.sfm import database
+from recon_cli.sfm.features.matching import create_database
 from recon_cli.sfm.job import CameraGroup, MappingJob
-from recon_cli.sfm.matching import create_database
 
 NAMES = ("a.png", "b.png", "c.png")
 

@@ -5,7 +5,7 @@ import pytest
 from recon_cli.io.depth_maps import write_depth, write_depth_list
 from recon_cli.io.images import write_png
 from recon_cli.scene.camera import Lens
-from recon_cli.sfm.depth_points import CELL, add_depth_points
+from recon_cli.sfm.poses.depth_points import CELL, add_depth_points
 
 LENS = Lens("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 NAMES = tuple(f"{index}.png" for index in range(4))

@@ -3,8 +3,8 @@ import pycolmap
 import pytest
 from made_model import FOCAL, HEIGHT, WIDTH, MadeModel, along, wall
 
-from recon_cli.sfm.evidence import OFFSETS, explained_matches, gather_evidence
 from recon_cli.sfm.limits import MAX_ERROR_PX
+from recon_cli.sfm.verdict.evidence import OFFSETS, explained_matches, gather_evidence
 
 
 def made(**changes) -> MadeModel:

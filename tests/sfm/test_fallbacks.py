@@ -13,17 +13,18 @@ from synthetic import center_error, make_capture, part
 
 from recon_cli.errors import SfmError
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import fallbacks, keyframes, mapper, parts, skeleton, wide_lens
-from recon_cli.sfm.fallbacks import (
+from recon_cli.sfm.features import keyframes
+from recon_cli.sfm.job import CameraGroup, Reporter, StepLog, parse
+from recon_cli.sfm.mapping import fallbacks, mapper, parts, skeleton, wide_lens
+from recon_cli.sfm.mapping.fallbacks import (
     MapperAttempt,
     best_attempt,
     list_fallbacks,
     reachable,
     shortfall,
 )
-from recon_cli.sfm.job import CameraGroup, Reporter, StepLog, parse
-from recon_cli.sfm.lens_trial import BetterLens
-from recon_cli.sfm.merge_models import ModelCandidate
+from recon_cli.sfm.mapping.lens_trial import BetterLens
+from recon_cli.sfm.mapping.merge_models import ModelCandidate
 
 NAMES = tuple(f"{index:06d}.png" for index in range(60))
 GOOD = MapperAttempt(

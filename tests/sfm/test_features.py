@@ -13,10 +13,11 @@ from sfm_inputs import texture
 
 from recon_cli.errors import SfmError
 from recon_cli.io.images import write_png
-from recon_cli.sfm import database, features
-from recon_cli.sfm.features import extract_features
+from recon_cli.sfm import database
+from recon_cli.sfm.features import features
+from recon_cli.sfm.features.features import extract_features
+from recon_cli.sfm.features.matching import create_database
 from recon_cli.sfm.job import CameraGroup, MappingJob, Phase, Reporter, parse
-from recon_cli.sfm.matching import create_database
 
 NAMES = ("a.png", "b.png", "c.png")
 WIDTH, HEIGHT = 240, 180

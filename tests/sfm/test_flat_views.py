@@ -13,9 +13,9 @@ from recon_cli.io.face_frames import read_face_frames
 from recon_cli.io.images import read_png, write_png
 from recon_cli.scene.faces import pixel_rays
 from recon_cli.scene.scene import views_ahead
-from recon_cli.sfm import undistort
-from recon_cli.sfm.flat_views import find_views, has_faces
 from recon_cli.sfm.job import Reporter, parse
+from recon_cli.sfm.views import undistort
+from recon_cli.sfm.views.flat_views import find_views, has_faces
 
 WIDTH, HEIGHT = 160, 120
 # 155, 104 and 85 degrees across

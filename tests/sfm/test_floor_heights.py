@@ -7,7 +7,7 @@ from made_model import MadeModel, along, wall
 from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.camera import PANORAMA
-from recon_cli.sfm.floor_heights import (
+from recon_cli.sfm.verdict.floor_heights import (
     MAX_LOG_STEP,
     SPREAD,
     compare_heights,

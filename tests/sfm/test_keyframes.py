@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import keyframes
+from recon_cli.sfm.features import keyframes
 
 
 def steady(count, life):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm.known_poses import align_to_given, measure_movement, near_pairs
+from recon_cli.sfm.poses.known_poses import align_to_given, measure_movement, near_pairs
 
 
 def cameras(centers, turn=0.0):

@@ -8,8 +8,9 @@ import pytest
 from test_wide_lens import FISHEYE, HEIGHT, WIDE, WIDTH, camera_of, shots
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import lens_trial, mapper, verdict
-from recon_cli.sfm.lens_trial import BetterLens, convert, find_better_lenses, gain_over
+from recon_cli.sfm.mapping import lens_trial, mapper
+from recon_cli.sfm.mapping.lens_trial import BetterLens, convert, find_better_lenses, gain_over
+from recon_cli.sfm.verdict import verdict
 
 STRETCHED = ("PINHOLE", (420.0, 340.0, 512.0, 384.0))  # pixels that are not square
 

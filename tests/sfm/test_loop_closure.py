@@ -5,10 +5,10 @@ import pytest
 from made_model import FOCAL, MadeModel, along, wall
 
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm import matching
-from recon_cli.sfm.loop_closure import bend_model, bend_segments, move_frames
-from recon_cli.sfm.shared_points import describe_segment, find_shared_points
-from recon_cli.sfm.stiffness import SCALES, measure_stiffness
+from recon_cli.sfm.features import matching
+from recon_cli.sfm.segments.loop_closure import bend_model, bend_segments, move_frames
+from recon_cli.sfm.segments.shared_points import describe_segment, find_shared_points
+from recon_cli.sfm.segments.stiffness import SCALES, measure_stiffness
 
 TURN = 24  # the frame from which on the walk comes back
 STAY = Similarity()

@@ -5,9 +5,9 @@ import pycolmap
 import pytest
 from synthetic import center_error, make_capture, part
 
-from recon_cli.sfm import mapper, merge_models
 from recon_cli.sfm.job import Reporter
-from recon_cli.sfm.mapper import triangulation_angles
+from recon_cli.sfm.mapping import mapper, merge_models
+from recon_cli.sfm.mapping.mapper import triangulation_angles
 
 pytestmark = pytest.mark.floors
 

@@ -15,10 +15,10 @@ from sfm_inputs import texture
 from recon_cli.errors import FormatError
 from recon_cli.io.images import write_png
 from recon_cli.scene.camera import Lens
-from recon_cli.sfm import database, matching
-from recon_cli.sfm.features import extract_features
-from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, parse
-from recon_cli.sfm.matching import (
+from recon_cli.sfm import database
+from recon_cli.sfm.features import matching
+from recon_cli.sfm.features.features import extract_features
+from recon_cli.sfm.features.matching import (
     create_database,
     exhaustive_pairs,
     match_descriptors,
@@ -26,6 +26,7 @@ from recon_cli.sfm.matching import (
     sequential_pairs,
     similar_pairs,
 )
+from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter, parse
 
 NAMES = ("a.png", "b.png", "c.png")
 

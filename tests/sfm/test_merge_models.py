@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 from synthetic import center_error, make_capture, moved, part
 
-from recon_cli.sfm import mapper, merge_models
-from recon_cli.sfm.weakest_cut import OutlierCamera
+from recon_cli.sfm.mapping import mapper, merge_models
+from recon_cli.sfm.verdict.weakest_cut import OutlierCamera
 
 # Features are exact to float32 (1e-4 px of 1000), the path is 9 units wide.
 EXACT = 1e-4

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm.evidence import MatchEvidence
 from recon_cli.sfm.limits import MIN_POSE_INLIERS
-from recon_cli.sfm.open_loops import find_open_loops
+from recon_cli.sfm.verdict.evidence import MatchEvidence
+from recon_cli.sfm.verdict.open_loops import find_open_loops
 
 COUNT = 40  # images on a ring, of which the last ones see again what the first ones saw
 NAMES = tuple(f"{index:06d}.png" for index in range(COUNT))

@@ -8,7 +8,7 @@ from sfm_inputs import texture
 
 from recon_cli.io.images import write_png
 from recon_cli.scene.faces import panorama_pixels, panorama_rays
-from recon_cli.sfm.features import find_on_faces
+from recon_cli.sfm.features.features import find_on_faces
 
 WIDTH, HEIGHT = 512, 256
 

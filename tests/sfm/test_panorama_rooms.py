@@ -7,12 +7,13 @@ import pytest
 from panoramas import make_panoramas
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import mapper, matching
-from recon_cli.sfm.fallbacks import describe_other_rooms, list_fallbacks
+from recon_cli.sfm.features import matching
 from recon_cli.sfm.limits import MIN_FRAMES, MIN_PANORAMA_SHARE
-from recon_cli.sfm.merge_models import ModelCandidate
-from recon_cli.sfm.trusted_part import deliver_parts, frames_asked, least_frames
-from recon_cli.sfm.verdict import examine
+from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.mapping.fallbacks import describe_other_rooms, list_fallbacks
+from recon_cli.sfm.mapping.merge_models import ModelCandidate
+from recon_cli.sfm.mapping.trusted_part import deliver_parts, frames_asked, least_frames
+from recon_cli.sfm.verdict.verdict import examine
 
 
 def test_a_room_that_matches_itself_alone_is_worth_another_mapper(tmp_path):

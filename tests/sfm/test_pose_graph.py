@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm.pose_graph import Joints, Motions, Ties, bend, measure_ties
+from recon_cli.sfm.segments.pose_graph import Joints, Motions, Ties, bend, measure_ties
 
 COUNT = 30
 CENTERS = np.column_stack([np.arange(COUNT, dtype=float), np.zeros(COUNT), np.zeros(COUNT)])

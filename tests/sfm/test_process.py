@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from recon_cli.progress import NullProgress
-from recon_cli.sfm import process
 from recon_cli.sfm.job import LOG_FILE, STEPS, Phase
-from recon_cli.sfm.process import Monitor, TimeUpError, last_error, run_job
+from recon_cli.sfm.mapping import process
+from recon_cli.sfm.mapping.process import Monitor, TimeUpError, last_error, run_job
 
 GLOG = "I20260101 10:00:00.000001 139 timer.cc:90] Elapsed time: 0.1 [minutes]\n"
 

@@ -14,10 +14,10 @@ import pytest
 from made_model import FOCAL, HEIGHT, WIDTH, MadeModel, along, moved, wall
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm import mapper
-from recon_cli.sfm.evidence import gather_evidence
 from recon_cli.sfm.limits import LOSS_SCALE
-from recon_cli.sfm.scale_drift import (
+from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.verdict.evidence import gather_evidence
+from recon_cli.sfm.verdict.scale_drift import (
     MAX_SCALE_ERROR,
     MAX_SCALE_INTERVAL,
     MIN_SURE_EXPLAINED,

@@ -7,7 +7,7 @@ from synthetic import make_capture
 
 from recon_cli.io.depth_maps import read_depth, write_depth, write_depth_list
 from recon_cli.scene.camera import Lens
-from recon_cli.sfm.scale_evidence import scale_from_depth, scale_from_poses, up_from_poses
+from recon_cli.sfm.poses.scale_evidence import scale_from_depth, scale_from_poses, up_from_poses
 
 FRAMES = 120
 

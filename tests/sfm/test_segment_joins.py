@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.segment_joins import (
+from recon_cli.sfm.segments.segment_joins import (
     camera_residuals,
     judge_join,
     place_segments,
 )
-from recon_cli.sfm.shared_points import SegmentCameras, SharedPoints
+from recon_cli.sfm.segments.shared_points import SegmentCameras, SharedPoints
 
 DEPTH = 3.0
 EXACT = 1e-6

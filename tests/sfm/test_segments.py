@@ -12,10 +12,10 @@ import pytest
 from recon_cli.errors import ConfigError, ReconError, SfmError, WorkspaceError
 from recon_cli.io.tracks import Tracks
 from recon_cli.progress import NullProgress
-from recon_cli.sfm import segments
 from recon_cli.sfm.job import SPLIT, CameraGroup, MappingJob, StepLog
-from recon_cli.sfm.process import CrashError
+from recon_cli.sfm.mapping.process import CrashError
 from recon_cli.sfm.results import SplitResult, StepResult
+from recon_cli.sfm.segments import segments
 
 
 def names_of(count):

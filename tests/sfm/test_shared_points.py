@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.limits import MIN_POSE_INLIERS
-from recon_cli.sfm.shared_points import estimate_similarity, to_sim3d
+from recon_cli.sfm.segments.shared_points import estimate_similarity, to_sim3d
 
 TRUTH = Similarity(
     2.0, Rotation.from_euler("y", 30, degrees=True).as_matrix(), np.array([1.0, -2.0, 3.0]))

@@ -10,12 +10,13 @@ import pytest
 from made_model import HEIGHT, WIDTH, MadeModel, along, moved, wall
 
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm import database, matching, skeleton
-from recon_cli.sfm.evidence import gather_evidence
+from recon_cli.sfm import database
+from recon_cli.sfm.features import matching
+from recon_cli.sfm.features.matching import read_verified
+from recon_cli.sfm.features.pair_checks import check_pairs, list_models
 from recon_cli.sfm.job import CameraGroup, MappingJob, Phase, Reporter, parse
-from recon_cli.sfm.matching import read_verified
-from recon_cli.sfm.pair_checks import check_pairs, list_models
-from recon_cli.sfm.skeleton import (
+from recon_cli.sfm.mapping import skeleton
+from recon_cli.sfm.mapping.skeleton import (
     build_beside,
     build_skeleton,
     choose_coarse_pairs,
@@ -27,7 +28,8 @@ from recon_cli.sfm.skeleton import (
     near_pairs,
     write_usable_matches,
 )
-from recon_cli.sfm.view_overlap import WIDEST, overlapping_images, overlapping_pairs
+from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_images, overlapping_pairs
+from recon_cli.sfm.verdict.evidence import gather_evidence
 
 SILENT = Reporter(io.BytesIO())
 

@@ -6,11 +6,11 @@ import pytest
 from panoramas import HEIGHT, WIDTH, make_panoramas
 from scipy.spatial.transform import Rotation
 
-from recon_cli.sfm import floor_heights
-from recon_cli.sfm.evidence import explained_matches, gather_evidence
-from recon_cli.sfm.scale_drift import find_weakest_scale
-from recon_cli.sfm.sphere import epipolar_errors, radian_px, ray_frames, unit_rays
-from recon_cli.sfm.verdict import examine
+from recon_cli.sfm.features.sphere import epipolar_errors, radian_px, ray_frames, unit_rays
+from recon_cli.sfm.verdict import floor_heights
+from recon_cli.sfm.verdict.evidence import explained_matches, gather_evidence
+from recon_cli.sfm.verdict.scale_drift import find_weakest_scale
+from recon_cli.sfm.verdict.verdict import examine
 
 
 def random_rays(count, seed=0):

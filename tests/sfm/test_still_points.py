@@ -3,8 +3,8 @@ import pytest
 from made_model import MadeModel, along, wall
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm.still_points import MAX_STILL, find_still_share
-from recon_cli.sfm.verdict import check_weak_link, examine
+from recon_cli.sfm.features.still_points import MAX_STILL, find_still_share
+from recon_cli.sfm.verdict.verdict import check_weak_link, examine
 
 
 def walk_under_text(points: int) -> MadeModel:

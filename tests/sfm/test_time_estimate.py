@@ -4,8 +4,8 @@ import time
 
 import pytest
 
-from recon_cli.sfm import time_estimate
-from recon_cli.sfm.time_estimate import (
+from recon_cli.sfm.mapping import time_estimate
+from recon_cli.sfm.mapping.time_estimate import (
     COSTS,
     PIECE_SECONDS,
     Costs,

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import make_capture
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm import mapper
 from recon_cli.sfm.job import Reporter
-from recon_cli.sfm.tracked_poses import adjust_tracked, hold_rest, match_near
+from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.poses.tracked_poses import adjust_tracked, hold_rest, match_near
 
 CAMERAS = {1}  # whose intrinsics are known
 

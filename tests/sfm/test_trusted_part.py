@@ -8,12 +8,12 @@ import pytest
 from made_model import MadeModel, along, broken_walk, doubled_place, moved, walk, wall
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import trusted_part
 from recon_cli.sfm.job import CameraGroup, MappingJob
-from recon_cli.sfm.mapper import list_registered
-from recon_cli.sfm.merge_models import ModelCandidate, build_posed_model
-from recon_cli.sfm.trusted_part import count_distinct_views, deliver_parts, find_parts
-from recon_cli.sfm.verdict import examine
+from recon_cli.sfm.mapping import trusted_part
+from recon_cli.sfm.mapping.mapper import list_registered
+from recon_cli.sfm.mapping.merge_models import ModelCandidate, build_posed_model
+from recon_cli.sfm.mapping.trusted_part import count_distinct_views, deliver_parts, find_parts
+from recon_cli.sfm.verdict.verdict import examine
 
 
 def prepare(made, folder, **changes):

@@ -10,9 +10,9 @@ from sfm_inputs import texture
 from synthetic import make_capture
 
 from recon_cli.io.images import read_png, write_png
-from recon_cli.sfm import undistort
-from recon_cli.sfm.flat_views import covered_share
 from recon_cli.sfm.job import Phase, Reporter, parse
+from recon_cli.sfm.views import undistort
+from recon_cli.sfm.views.flat_views import covered_share
 
 WIDTH, HEIGHT = 120, 90
 

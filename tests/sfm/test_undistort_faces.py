@@ -14,9 +14,9 @@ from recon_cli.io.colmap import read_scene
 from recon_cli.io.face_frames import read_face_frames
 from recon_cli.io.images import read_png, write_png
 from recon_cli.scene.faces import CUBE, panorama_rays, pixel_rays, view_name
-from recon_cli.sfm import undistort
-from recon_cli.sfm.face_images import PICTURES, cube_warps, cut_face
+from recon_cli.sfm.features.face_images import PICTURES, cube_warps, cut_face
 from recon_cli.sfm.job import Reporter
+from recon_cli.sfm.views import undistort
 
 
 def colours(rays):

@@ -9,8 +9,8 @@ import pytest
 from made_model import WIDTH, MadeModel, along, broken_walk, doubled_place, moved, walk, wall
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm.evidence import gather_evidence
-from recon_cli.sfm.verdict import (
+from recon_cli.sfm.verdict.evidence import gather_evidence
+from recon_cli.sfm.verdict.verdict import (
     MAX_SHIFT,
     Histogram,
     ModelVerdict,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from recon_cli.sfm import view_graph
+from recon_cli.sfm.verdict import view_graph
 
 PAIRS = np.array([[0, 1], [1, 2], [0, 2], [3, 4], [4, 5], [3, 5], [2, 3]])
 TRIANGLES = view_graph.weights(6, PAIRS, np.array([9, 9, 9, 9, 9, 9, 1]))  # two, tied by one weight

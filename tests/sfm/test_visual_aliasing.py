@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from made_model import MadeModel, along, moved, wall
 
-from recon_cli.sfm import visual_aliasing
-from recon_cli.sfm.evidence import gather_evidence
+from recon_cli.sfm.verdict import visual_aliasing
+from recon_cli.sfm.verdict.evidence import gather_evidence
 
 
 def measured(made: MadeModel, folder) -> visual_aliasing.Overlap:

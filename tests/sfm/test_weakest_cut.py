@@ -3,8 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from recon_cli.sfm import limits, weakest_cut
-from recon_cli.sfm.evidence import MatchEvidence
+from recon_cli.sfm import limits
+from recon_cli.sfm.verdict import weakest_cut
+from recon_cli.sfm.verdict.evidence import MatchEvidence
 
 COUNT = 20
 NAMES = tuple("abcdefghijklmnopqrst")

@@ -13,8 +13,9 @@ import pytest
 from synthetic import make_capture
 
 from recon_cli.errors import SfmError
-from recon_cli.sfm import fallbacks, mapper, matching, wide_lens
+from recon_cli.sfm.features import matching
 from recon_cli.sfm.job import CameraGroup, Reporter
+from recon_cli.sfm.mapping import fallbacks, mapper, wide_lens
 
 WIDTH, HEIGHT = 1024, 768
 FISHEYE = ("OPENCV_FISHEYE", (360.0, 363.0, 518.0, 380.0, 0.03, -0.006, 0.001, -0.0001))

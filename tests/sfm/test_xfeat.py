@@ -3,8 +3,13 @@ import numpy as np
 import pytest
 import torch
 
-from recon_cli.sfm import xfeat
-from recon_cli.sfm.xfeat import DESCRIPTOR_STEPS, Network, find_learned_features, parameter_shapes
+from recon_cli.sfm.features import xfeat
+from recon_cli.sfm.features.xfeat import (
+    DESCRIPTOR_STEPS,
+    Network,
+    find_learned_features,
+    parameter_shapes,
+)
 
 
 def random_weights(dtype=torch.float64):

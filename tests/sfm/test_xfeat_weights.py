@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from recon_cli.errors import FormatError, InputError
-from recon_cli.sfm import xfeat_weights
-from recon_cli.sfm.xfeat import parameter_shapes
+from recon_cli.sfm.features import xfeat_weights
+from recon_cli.sfm.features.xfeat import parameter_shapes
 
 
 @pytest.fixture(autouse=True)

@@ -1,7 +1,7 @@
 """A training that dies right after it has saved its state, as by kill -9."""
 
-from recon_cli.train import runner
-from recon_cli.train.state import save_state
+from recon_cli.train.fit import runner
+from recon_cli.train.fit.state import save_state
 
 
 class Killed(Exception):  # noqa: N818 - an event, not an error

@@ -12,8 +12,8 @@ import pytest
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.io.images import write_png
-from recon_cli.sfm import process, worker
 from recon_cli.sfm.job import Reporter
+from recon_cli.sfm.mapping import process, worker
 from recon_cli.stages import sfm
 from recon_cli.workspace.records import Frame, FrameList, Group
 

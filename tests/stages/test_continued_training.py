@@ -12,8 +12,8 @@ from recon_cli.config.stages import PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
-from recon_cli.train import fit
 from recon_cli.train import plan as planning
+from recon_cli.train.fit import loop
 from recon_cli.workspace.summaries import LogRow, TrainPlan
 
 pytestmark = pytest.mark.integration
@@ -128,8 +128,8 @@ def test_after_few_more_steps_pruning_at_the_middle_recovers_as_at_the_end(
 
 def test_after_an_early_stop_it_goes_on_from_the_steps_taken(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(fit, "report_every", lambda _: 4)
-        patch.setattr(fit, "validation_psnr", lambda *_: 20.0)
+        patch.setattr(loop, "report_every", lambda _: 4)
+        patch.setattr(loop, "validation_psnr", lambda *_: 20.0)
         (tmp_path / "short").mkdir()
         first = train.run(SHORT, inputs, tmp_path / "short", CONTEXT)
         second = go_on(LONG, inputs, tmp_path / "short", tmp_path / "long")

@@ -27,7 +27,7 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
 from recon_cli.splats.registry import read_splats
 from recon_cli.splats.spz import load_spz, unpack
-from recon_cli.train.train_data import read_config, write_config
+from recon_cli.train.fit.train_data import read_config, write_config
 from recon_cli.workspace.atomic import write_json
 
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0], [0.48, 0.64, 0.6]])

@@ -20,9 +20,9 @@ from recon_cli.render import render
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.align_world import world_transform
+from recon_cli.sfm.poses.align_world import world_transform
 from recon_cli.splats.ply import read_ply, write_ply
-from recon_cli.train.train_data import write_config
+from recon_cli.train.fit.train_data import write_config
 
 
 @pytest.fixture

@@ -18,7 +18,8 @@ from recon_cli.context import TrainCallback
 from recon_cli.errors import FormatError, StageError, TrainingError
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export, prune, train
-from recon_cli.train import prune_run, runner
+from recon_cli.train.fit import runner
+from recon_cli.train.prune import prune_run
 
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
 

@@ -15,8 +15,8 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.export import verify
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import evaluate, export, prune, train
-from recon_cli.train import runner
-from recon_cli.train.state import save_state
+from recon_cli.train.fit import runner
+from recon_cli.train.fit.state import save_state
 
 CONTEXT = StageContext(backend="numba")
 

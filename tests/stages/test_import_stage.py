@@ -27,7 +27,7 @@ from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.splats.registry import FORMATS, load_splats
 from recon_cli.splats.spz import write_spz
 from recon_cli.stages import evaluate, import_scene, prune
-from recon_cli.train.train_data import read_config
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.records import ImportRecord

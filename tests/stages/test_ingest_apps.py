@@ -10,7 +10,7 @@ from PIL import Image
 
 from recon_cli.config.stages import IngestConfig
 from recon_cli.io.depth_maps import read_depth, read_depth_list
-from recon_cli.sfm.align_world import world_transform
+from recon_cli.sfm.poses.align_world import world_transform
 from recon_cli.workspace.records import POSES, read_frame_list, read_poses
 
 PICTURE = 12  # of 255, mean: JPEG and H.264 of small pictures; the wrong picture is 30 off

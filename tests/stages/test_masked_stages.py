@@ -15,8 +15,8 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ReconstructionError, TrainingError
 from recon_cli.io.images import read_image, write_png
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import runner
-from recon_cli.train.state import save_state
+from recon_cli.train.fit import runner
+from recon_cli.train.fit.state import save_state
 
 pytestmark = pytest.mark.integration
 

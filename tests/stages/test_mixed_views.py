@@ -15,8 +15,8 @@ from recon_cli.io.images import read_image
 from recon_cli.io.training_scene import load_scene
 from recon_cli.io.views import size_summary
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import train_data
-from recon_cli.train.train_data import estimate_memory
+from recon_cli.train.fit import train_data
+from recon_cli.train.fit.train_data import estimate_memory
 
 CONFIG = RunConfig(
     iterations=160, densify_every=10, densify_gradient=1e-5, max_gaussians=120, sh_rate=0.05)

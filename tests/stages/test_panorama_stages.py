@@ -9,7 +9,7 @@ from recon_cli.cli import main
 from recon_cli.evaluation.scores import Metrics
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.faces import CUBE
-from recon_cli.sfm.known_poses import align_to_given
+from recon_cli.sfm.poses.known_poses import align_to_given
 
 pytestmark = pytest.mark.integration
 

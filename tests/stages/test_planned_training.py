@@ -15,9 +15,9 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import TrainingError
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
-from recon_cli.train import fit, train_data
 from recon_cli.train import plan as planning
-from recon_cli.train.train_data import estimate_memory
+from recon_cli.train.fit import loop, train_data
+from recon_cli.train.fit.train_data import estimate_memory
 
 pytestmark = pytest.mark.integration
 
@@ -173,8 +173,8 @@ STOPPING = TrainConfig(iterations=160, max_gaussians=120, densify_every=10, chec
 @pytest.fixture
 def flat(monkeypatch):
     """Validation views that never change, looked at every four steps."""
-    monkeypatch.setattr(fit, "report_every", lambda _: 4)
-    monkeypatch.setattr(fit, "validation_psnr", lambda *_: 20.0)
+    monkeypatch.setattr(loop, "report_every", lambda _: 4)
+    monkeypatch.setattr(loop, "validation_psnr", lambda *_: 20.0)
 
 
 @pytest.mark.usefixtures("flat")

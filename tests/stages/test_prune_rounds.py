@@ -16,8 +16,9 @@ from recon_cli.render.registry import use_threads
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
-from recon_cli.train import prune_run, runner
-from recon_cli.train.state import save_state
+from recon_cli.train.fit import runner
+from recon_cli.train.fit.state import save_state
+from recon_cli.train.prune import prune_run
 from recon_cli.workspace.atomic import write_bytes
 
 pytestmark = pytest.mark.integration

@@ -48,7 +48,7 @@ def workers():
     """The mapping processes that this test process has started."""
     return [
         child for child in psutil.Process().children(recursive=True)
-        if "recon_cli.sfm.worker" in " ".join(child.cmdline())
+        if "recon_cli.sfm.mapping.worker" in " ".join(child.cmdline())
     ]
 
 

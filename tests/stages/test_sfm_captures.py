@@ -12,7 +12,7 @@ from recon_cli.errors import SfmError
 from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.sfm import database
 from recon_cli.sfm.job import CLIP_SECONDS
-from recon_cli.sfm.verdict import find_jumps
+from recon_cli.sfm.verdict.verdict import find_jumps
 from recon_cli.stages import sfm
 from recon_cli.workspace.records import Frame, FrameList, Group
 

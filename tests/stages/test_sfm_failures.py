@@ -13,10 +13,11 @@ from sfm_inputs import run, run_here, texture, turning, write_inputs
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, SfmError
-from recon_cli.sfm import database, time_estimate
+from recon_cli.sfm import database
 from recon_cli.sfm.job import CameraGroup
+from recon_cli.sfm.mapping import time_estimate
 from recon_cli.sfm.results import MappingResult, ModelResult, PartResult
-from recon_cli.sfm.segments import SegmentRuns
+from recon_cli.sfm.segments.segments import SegmentRuns
 from recon_cli.stages import sfm
 from recon_cli.workspace.records import Frame, FrameList, Group
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary

@@ -10,7 +10,7 @@ from recon_cli.context import StageContext
 from recon_cli.errors import TrainingError
 from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.camera import Camera
-from recon_cli.train.train_data import load_task
+from recon_cli.train.fit.train_data import load_task
 
 
 def in_units(scene, factor):

@@ -9,8 +9,8 @@ from foreign import recon, truth, with_views
 
 from recon_cli.cli import main
 from recon_cli.splats.ply import read_ply, write_ply
-from recon_cli.train import runner
-from recon_cli.train.state import save_state
+from recon_cli.train.fit import runner
+from recon_cli.train.fit.state import save_state
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.records import ImportRecord
 

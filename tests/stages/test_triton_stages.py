@@ -17,8 +17,8 @@ from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig
 from recon_cli.context import StageInputs
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import evaluate, prune, train
-from recon_cli.train import runner
-from recon_cli.train.state import save_state
+from recon_cli.train.fit import runner
+from recon_cli.train.fit.state import save_state
 
 pytest.importorskip("triton", reason="triton is not installed")
 pytestmark = pytest.mark.slow

@@ -6,7 +6,7 @@ from interpreter import INTERPRETED
 from scenes import random_splats
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.fit.optimizer import SplatOptimizer
 
 # float32 in another order of operations, over 20 steps: a few units in the last place.
 STEPS_TOLERANCE = 1e-6

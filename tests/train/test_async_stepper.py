@@ -15,15 +15,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from recon_cli.errors import TrainingError
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train import stepper
-from recon_cli.train.fit import fit
-from recon_cli.train.importance import Importance
+from recon_cli.train.fit import stepper
+from recon_cli.train.fit.importance import Importance
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.state import load_state, new_state, save_state
+from recon_cli.train.fit.stepper import Stepper
+from recon_cli.train.fit.task import Task
 from recon_cli.train.parts.exposure import Exposure
 from recon_cli.train.parts.photometry import Photometry
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import load_state, new_state, save_state
-from recon_cli.train.stepper import Stepper
-from recon_cli.train.task import Task
 
 triton_step = pytest.importorskip(
     "recon_cli.render.triton.step", reason="triton is not installed")

@@ -6,8 +6,8 @@ import pytest
 import torch
 from tiny_task import CONFIG, STRATEGIES, first_state, same, saved_and_loaded, tiny_task
 
-from recon_cli.train.fit import fit
-from recon_cli.train.stepper import Stepper
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.stepper import Stepper
 
 every_cpu_backend = pytest.mark.parametrize("backend", ["torch", "numba"])
 every_strategy = pytest.mark.parametrize("name", STRATEGIES)

@@ -15,10 +15,11 @@ from recon_cli.progress import NullProgress
 from recon_cli.scene.cells import Cell
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import train as stage
-from recon_cli.train import blocks, merge_blocks, runner
-from recon_cli.train.blocks import BlockJob, count_blocks
-from recon_cli.train.runner import CHECKPOINT
-from recon_cli.train.state import save_state
+from recon_cli.train.blocks import blocks, merge_blocks
+from recon_cli.train.blocks.blocks import BlockJob, count_blocks
+from recon_cli.train.fit import runner
+from recon_cli.train.fit.runner import CHECKPOINT
+from recon_cli.train.fit.state import save_state
 
 FAST = ("--iterations", "10", "--max-size", "32", "--sh-degree", "0", "--threads", "1")
 

@@ -9,8 +9,8 @@ from tiny_task import first_state, same, tiny_task
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.train.cost import CostModel, LevelCost, calibrate, counts
-from recon_cli.train.fit import fit
-from recon_cli.train.schedule import Schedule
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import Schedule
 
 FREE = LevelCost(1, 0.0, 0.0)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import joined, one_splat
 
-from recon_cli.train.densification import BudgetRule, decay_opacities, densify_budget, draw_rows
+from recon_cli.train.fit.densification import BudgetRule, decay_opacities, densify_budget, draw_rows
 
 RULE = BudgetRule(target=4, min_opacity=0.005, decay=1.0)
 

@@ -8,9 +8,9 @@ from scenes import random_splats, with_harmonics
 from tiny_task import STRATEGIES, first_state, tiny_task
 
 from recon_cli.scene.splats import with_rows
-from recon_cli.train import densification
-from recon_cli.train.fit import fit
-from recon_cli.train.state import DensificationStats
+from recon_cli.train.fit import densification
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.state import DensificationStats
 
 N, COLORED = 40, 13
 

@@ -10,14 +10,14 @@ from scenes import joined, one_splat
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.render import Statistics
-from recon_cli.train.densification import (
+from recon_cli.train.fit.densification import (
     STRATEGIES,
     DensifyRule,
     cap_opacities,
     densify_reference,
 )
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import DensificationStats, new_state
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.state import DensificationStats, new_state
 
 RULE = DensifyRule(gradient=1.0, clone_scale=0.1, min_opacity=0.005, large_scale=1.0, most=100)
 

@@ -16,13 +16,13 @@ from recon_cli.render.contract import StepOptions
 from recon_cli.render.depth_loss import depth_loss
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.train_view import SensorDepth, TrainView
-from recon_cli.train.fit import fit
-from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_loss
-from recon_cli.train.initialize import first_state as begin_at
+from recon_cli.train.fit.gradient import RENDERED_NOISE, gradient_step, photometric_loss
+from recon_cli.train.fit.initialize import first_state as begin_at
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import Schedule, make_schedule
+from recon_cli.train.fit.state import new_state
 from recon_cli.train.parts.table import step_options
 from recon_cli.train.parts.trials import examine
-from recon_cli.train.schedule import Schedule, make_schedule
-from recon_cli.train.state import new_state
 
 # Gradients of float32 against float64, relative in the 2-norm, as in test_gradient.
 TOLERANCE = 1e-5

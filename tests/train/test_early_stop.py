@@ -7,9 +7,9 @@ import pytest
 from tiny_task import CONFIG, STRATEGIES, Hooks, first_state, same, saved_and_loaded, tiny_task
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.train import fit as fitting
-from recon_cli.train.fit import fit
-from recon_cli.train.schedule import Schedule, next_iteration
+from recon_cli.train.fit import loop as fitting
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import Schedule, next_iteration
 
 PLAN = Schedule(RunConfig(iterations=1000))
 

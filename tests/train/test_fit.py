@@ -24,9 +24,9 @@ from recon_cli.io.images import fill_masked
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.render import available_backends, render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import fit, validation_psnr
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.state import load_state, save_state
+from recon_cli.train.fit.gradient import gradient_step
+from recon_cli.train.fit.loop import fit, validation_psnr
+from recon_cli.train.fit.state import load_state, save_state
 
 RUNS = [(status.name, device) for status in available_backends() if not status.missing
         for device in status.devices]
@@ -278,7 +278,7 @@ def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monke
     before = state.splats.map(lambda tensor: tensor.detach().clone())
     compute = gradient_step(backend)
     monkeypatch.setattr(
-        "recon_cli.train.stepper.gradient_step",
+        "recon_cli.train.fit.stepper.gradient_step",
         lambda *_: lambda *given, **named: (float("nan"), compute(*given, **named)[1]))
     run(state, task, 2)
     assert (state.iteration, state.skipped, state.optimizer.count) == (2, 2, 0)

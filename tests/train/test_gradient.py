@@ -13,8 +13,8 @@ from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step, photometric_loss
-from recon_cli.train.state import new_state
+from recon_cli.train.fit.gradient import gradient_step, photometric_loss
+from recon_cli.train.fit.state import new_state
 
 # Gradients of float32 against float64, relative in the 2-norm. Measured 3e-6 (torch), 8e-7 (numba).
 TOLERANCE = 1e-5

@@ -11,10 +11,10 @@ from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state
+from recon_cli.train.fit.initialize import first_state
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import Schedule
 from recon_cli.train.parts.trials import examine
-from recon_cli.train.schedule import Schedule
 
 STEPS = 200
 PLAIN = replace(

@@ -10,9 +10,9 @@ from recon_cli.config.stages import PRUNE_SCORES, RunConfig
 from recon_cli.render import render
 from recon_cli.render.contract import StepOptions
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.gradient import gradient_step
-from recon_cli.train.importance import RANDOM, Importance, paper_score
-from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.fit.gradient import gradient_step
+from recon_cli.train.fit.importance import RANDOM, Importance, paper_score
+from recon_cli.train.fit.optimizer import SplatOptimizer
 
 CPU = torch.device("cpu")
 

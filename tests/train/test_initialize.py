@@ -13,10 +13,10 @@ from tiny_task import CONFIG, tiny_task
 
 from recon_cli.errors import FormatError, TrainingError
 from recon_cli.scene.splats import SH_C0
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state, restore_state, splats_from_points
+from recon_cli.train.fit.initialize import first_state, restore_state, splats_from_points
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.state import save_state
 from recon_cli.train.parts.stereo import SurfacePoints
-from recon_cli.train.state import save_state
 
 GRID = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
 GREY = np.full((27, 3), 128, np.uint8)

@@ -7,7 +7,7 @@ from skimage.metrics import structural_similarity
 
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.render.numba.loss import MAPS, MIN_WIDTH, photometric
-from recon_cli.train.gradient import blur, photometric_loss
+from recon_cli.train.fit.gradient import blur, photometric_loss
 
 # The fused loss computes in float32. Measured 5e-7, and 3e-6 for the gradient.
 LOSS_TOLERANCE = 1e-6

@@ -18,7 +18,7 @@ from scenes import joined, random_splats
 from recon_cli.config.stages import RunConfig
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.scene.splats import Splats
-from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.fit.optimizer import SplatOptimizer
 
 BYTES = 1500  # a Gaussian may take in training: what is promised for a million on a laptop
 

@@ -6,7 +6,7 @@ from adam_runs import BACKENDS, CONFIG, ROLES, assert_close, every_kind, feed, g
 from scenes import random_splats, with_harmonics
 
 from recon_cli.scene.splats import TERMS
-from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.fit.optimizer import SplatOptimizer
 
 
 def some(n, degree, colored, *, seed=0):

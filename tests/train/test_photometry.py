@@ -8,11 +8,11 @@ import torch
 from tiny_task import CONFIG, EXTENT, first_state, same, tiny_task
 
 from recon_cli.render.response import ResponseGradient, transmission
-from recon_cli.train.fit import fit
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.state import load_state, save_state
 from recon_cli.train.parts.exposure import Exposure
 from recon_cli.train.parts.photometry import Photometry, read_falloffs, write_photometry
 from recon_cli.train.parts.vignette import Vignettes, falling
-from recon_cli.train.state import load_state, save_state
 from recon_cli.workspace.summaries import PhotometrySummary
 
 pytestmark = pytest.mark.integration

@@ -15,11 +15,11 @@ from recon_cli.errors import ConfigError
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train import plan
 from recon_cli.train.cost import CostModel, LevelCost
+from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.parts.decisions import NO_TIME, skip_trial
 from recon_cli.train.parts.stereo import SurfacePoints
 from recon_cli.train.parts.trials import Needs
 from recon_cli.train.plan import QUALITIES, Facts, make_plan
-from recon_cli.train.train_data import read_config
 from recon_cli.workspace.summaries import TrainPlan
 
 FACTS = Facts(detail=60_000, views=40, points=9000, room=10**9)

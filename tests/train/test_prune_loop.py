@@ -10,9 +10,12 @@ from tiny_task import importance_of
 
 from recon_cli.config.stages import PRUNE_SCORES, RunConfig
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import fit
-from recon_cli.train.importance import RANDOM
-from recon_cli.train.prune_loop import (
+from recon_cli.train.fit.importance import RANDOM
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import RecoverySchedule, Schedule
+from recon_cli.train.fit.state import new_state
+from recon_cli.train.fit.task import Task
+from recon_cli.train.prune.prune_loop import (
     LAST_ROUND,
     PruneRun,
     Removal,
@@ -23,9 +26,6 @@ from recon_cli.train.prune_loop import (
     rounds_within,
     survivors,
 )
-from recon_cli.train.schedule import RecoverySchedule, Schedule
-from recon_cli.train.state import new_state
-from recon_cli.train.task import Task
 
 CONFIG = RunConfig(iterations=100, max_gaussians=40)
 

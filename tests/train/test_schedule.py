@@ -4,7 +4,7 @@ import pytest
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.errors import ConfigError
-from recon_cli.train.schedule import ContinuedSchedule, Schedule, next_iteration
+from recon_cli.train.fit.schedule import ContinuedSchedule, Schedule, next_iteration
 
 
 def test_a_run_of_30000_follows_the_reference():

@@ -7,9 +7,9 @@ import pytest
 from walls import AROUND, camera, grain, shading, views_of
 
 from recon_cli.scene.covisibility import observe_points
+from recon_cli.train.fit.task import Evidence
 from recon_cli.train.parts import stereo
 from recon_cli.train.parts.stereo import SurfacePoints, find_surfaces
-from recon_cli.train.task import Evidence
 
 # along the edges of a wall whose middle has no texture
 EDGE = np.array([[3.0, y, z] for y in np.linspace(-1.6, 1.6, 40) for z in (-1.1, 1.1)])

@@ -11,9 +11,9 @@ from tiny_task import CONFIG, EXTENT, same, tiny_task
 from recon_cli.io.images import reduce_view
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import begin_state
-from recon_cli.train.task import Pyramid
+from recon_cli.train.fit.initialize import begin_state
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.task import Pyramid
 
 # A picture that is rendered small and one that is rendered large and averaged differ by what a
 # pixel's blur adds. Measured .03 on soft Gaussians; a camera off by half a pixel gives .09.

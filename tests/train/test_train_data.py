@@ -7,7 +7,7 @@ import pytest
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.errors import FormatError, TrainingError
-from recon_cli.train.train_data import (
+from recon_cli.train.fit.train_data import (
     estimate_memory,
     gaussians_within,
     read_config,

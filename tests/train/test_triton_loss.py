@@ -4,7 +4,7 @@ import pytest
 import torch
 from interpreter import DEVICE
 
-from recon_cli.train.gradient import photometric_loss
+from recon_cli.train.fit.gradient import photometric_loss
 
 loss_module = pytest.importorskip("recon_cli.render.triton.loss", reason="triton is not installed")
 # float32; variances are differences of squares, as in tests/train/test_losses.py

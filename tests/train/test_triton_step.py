@@ -15,8 +15,8 @@ from recon_cli.render.depth_loss import depth_loss
 from recon_cli.render.response import Response
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.train_view import SensorDepth, TrainView
-from recon_cli.train.gradient import RENDERED_NOISE, gradient_step, photometric_loss
-from recon_cli.train.optimizer import SplatOptimizer
+from recon_cli.train.fit.gradient import RENDERED_NOISE, gradient_step, photometric_loss
+from recon_cli.train.fit.optimizer import SplatOptimizer
 
 pytest.importorskip("triton", reason="triton is not installed")
 WIDTH, HEIGHT = 18, 17  # four tiles, three of them cut by the border

@@ -7,10 +7,10 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import TrainCallback
 from recon_cli.render import render
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.importance import Importance, add_views
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import load_state, new_state, save_state
-from recon_cli.train.task import Task
+from recon_cli.train.fit.importance import Importance, add_views
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.state import load_state, new_state, save_state
+from recon_cli.train.fit.task import Task
 
 CONFIG = RunConfig(
     iterations=60, densify="reference", densify_every=10, densify_gradient=1e-5, max_gaussians=90,

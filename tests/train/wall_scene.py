@@ -10,9 +10,9 @@ from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.task import Task
 from recon_cli.train.parts.part import TrialScene
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.task import Task
 
 CONFIG = RunConfig(iterations=500, max_gaussians=2000, sh_degree=0, images="original")
 EXTENT = 0.5

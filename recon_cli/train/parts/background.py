@@ -22,10 +22,10 @@ from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.fit.task import Evidence
 from recon_cli.train.parts.decisions import Rule
 from recon_cli.train.parts.part import Part, Sign, Start, TrialScene
 from recon_cli.train.parts.sparse_points import project_points
-from recon_cli.train.task import Evidence
 
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart

@@ -9,9 +9,9 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.io.sensor_depth import MOST_SAMPLES, SAMPLE_BYTES, SensorViews, read_sensor_depth
 from recon_cli.scene.scene import Scene
+from recon_cli.train.fit.schedule import Schedule
 from recon_cli.train.parts.decisions import Rule
 from recon_cli.train.parts.part import Part, Sign, TrialScene
-from recon_cli.train.schedule import Schedule
 
 # Loss that speaks against depth, which was measured: with exact depth a wall lost -.04 to .13 dB by
 # the seed alone, and with depth that is wrong by a third -.06 to .19.

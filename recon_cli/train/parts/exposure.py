@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.render.response import Response, ResponseGradient
+from recon_cli.train.fit.task import Evidence, Task
 from recon_cli.train.parts.part import Part, Sign, TrialScene
 from recon_cli.train.parts.photometry import FittedPart
 from recon_cli.train.parts.sparse_points import GainEstimate, estimate_gains
-from recon_cli.train.task import Evidence, Task
 from recon_cli.workspace.summaries import PhotometrySummary
 
 # Falling to a tenth as in INRIA 3DGS, but lower: on two phone videos, held-out views gained .72 and

@@ -17,10 +17,10 @@ from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.deadline import Deadline
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.task import Evidence, Task
 from recon_cli.train.parts.decisions import Rule
 from recon_cli.train.parts.photometry import FittedPart
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.task import Evidence, Task
 
 if TYPE_CHECKING:
     from recon_cli.train.parts.trials import Trials

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render.response import LensFalloffs, Response, ResponseGradient
-from recon_cli.train.optimizer import SparseAdam
+from recon_cli.train.fit.optimizer import SparseAdam
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.summaries import PhotometrySummary
 

@@ -19,9 +19,9 @@ from recon_cli.io.images import reduce_to
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo.depths import StereoView, find_depths, find_partners, unproject
+from recon_cli.train.fit.task import Evidence, Task
 from recon_cli.train.parts.part import Part, Sign, Start
 from recon_cli.train.parts.sparse_points import estimate_gains
-from recon_cli.train.task import Evidence, Task
 
 _VIEWS = 60  # searched, evenly spread
 _SIDE = 300  # pixels of their longer side

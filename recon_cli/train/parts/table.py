@@ -10,9 +10,9 @@ from dataclasses import replace
 from typing import Any
 
 from recon_cli.config.stages import RunConfig, TrainConfig
+from recon_cli.train.fit.schedule import Schedule
 from recon_cli.train.parts import background, depth, exposure, harmonics, moving, stereo, vignette
 from recon_cli.train.parts.part import Part, Sign, TrialScene
-from recon_cli.train.schedule import Schedule
 
 
 def _find_twins(scene: TrialScene) -> Sign:

@@ -24,14 +24,14 @@ from recon_cli.io.images import reduce_view
 from recon_cli.render.response import LensFalloffs
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.fit import fit
-from recon_cli.train.initialize import first_state
+from recon_cli.train.fit.initialize import first_state
+from recon_cli.train.fit.loop import fit
+from recon_cli.train.fit.schedule import Schedule
+from recon_cli.train.fit.state import TrainState
 from recon_cli.train.masks import Regions
 from recon_cli.train.parts.decisions import NO_TIME, Rule, Split, decide, skip_trial, split
 from recon_cli.train.parts.part import AUTO, LEVEL, Part, TrialScene
 from recon_cli.train.parts.table import PARTS, TRIED, model_parts, with_part, without_open_parts
-from recon_cli.train.schedule import Schedule
-from recon_cli.train.state import TrainState
 from recon_cli.workspace.summaries import TrialDecision
 
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from recon_cli.render.response import Response, ResponseGradient, lens
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
+from recon_cli.train.fit.task import Evidence, Task
 from recon_cli.train.parts.decisions import Rule
 from recon_cli.train.parts.part import Part, Sign, TrialScene
 from recon_cli.train.parts.photometry import FittedPart
 from recon_cli.train.parts.sparse_points import choose_points, log_colors, project_points
-from recon_cli.train.task import Evidence, Task
 from recon_cli.workspace.summaries import PhotometrySummary, VignetteSummary
 
 _RATE, _FALL = 0.002, 0.1  # of the exponents; it falls to a tenth, as that of exposures does

@@ -1,0 +1,1 @@
+"""Features of images, and the pairs that their matches make."""

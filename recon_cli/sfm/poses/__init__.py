@@ -1,0 +1,1 @@
+"""Poses that are known before, and the world frame of a model."""

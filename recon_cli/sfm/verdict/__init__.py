@@ -1,0 +1,1 @@
+"""Whether a model can be trusted, and the evidence for it."""

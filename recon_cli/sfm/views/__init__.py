@@ -1,0 +1,1 @@
+"""The views that training sees: images without lens distortion."""

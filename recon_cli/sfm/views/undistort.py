@@ -1,0 +1,178 @@
+"""The model in the world frame, and its frames without lens distortion.
+
+Originals and denoised twins get the same pinhole camera. COLMAP scales it so that no pixel of the
+result lies outside the frame (blank_pixels = 0): a model learns no black borders.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import filecmp
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial, reduce
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon_cli.errors import format_count
+from recon_cli.io.colmap import Pinhole
+from recon_cli.io.colmap_library import check_model, pycolmap, write_model
+from recon_cli.io.images import read_png, write_png
+from recon_cli.io.training_scene import held_out_names
+from recon_cli.room.scale import ScaleBetween
+from recon_cli.scene.faces import is_cube_face, view_name
+from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
+from recon_cli.sfm.mapping.parts import check_part
+from recon_cli.sfm.poses.align_world import refuse_contradiction, world_transform
+from recon_cli.sfm.poses.depth_points import add_depth_points
+from recon_cli.sfm.poses.scale_evidence import ask_device
+from recon_cli.sfm.results import PlacedResult, UndistortedResult
+from recon_cli.sfm.segments.shared_points import to_sim3d
+from recon_cli.sfm.verdict.scale_drift import ScaleCut
+from recon_cli.sfm.views.flat_views import (
+    MOST_LOST,
+    FlatView,
+    find_views,
+    has_faces,
+    places_in,
+    resample,
+)
+from recon_cli.sfm.views.undistort_faces import write_views
+from recon_cli.workspace import atomic
+from recon_cli.workspace.summaries import WorldSummary
+
+IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
+
+
+def place_model(job: MappingJob) -> PlacedResult:
+    """Writes the model of the job's part, moved into the world frame, into out/sparse.
+
+    The axes of a data set with poses are left as they are, unless it knows up, or says that they
+    are arbitrary. ConfigError if the part, or a place of --scale-between, is unknown; SfmError if
+    what tells the scale contradicts itself, unless that is accepted.
+    """
+    check_part(job)
+    part = job.parts / str(job.part)
+    model = pycolmap.Reconstruction(part)
+    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    viewmats = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+                for name, image in images.items()}
+    device = ask_device(job, model, viewmats)
+    if device.depth_scale is not None and job.pose_use != "keep" and job.poses is not None:
+        ingest = job.poses.parent
+        add_depth_points(model, ingest, job.frames, device.depth_scale,
+                         without=held_out_names(ingest))
+    several = {number for number, camera in model.cameras.items() if has_faces(camera)}
+    world = world_transform(
+        np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,
+        gravity=job.gravity and device.axes_open, given_up=device.up,
+        scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
+        metric=device.metric, sources=device.sources,
+        pinholes={name: _pinhole(image.camera) for name, image in images.items()
+                  if image.camera_id not in several})
+    refuse_contradiction(world.evidence, accepted=job.accept_weak)
+    if device.remark:
+        world = dataclasses.replace(world, sentences=(*world.sentences, device.remark))
+    verdict = atomic.read_json(part / VERDICT) if (part / VERDICT).exists() else {}
+    if verdict.get("scale"):
+        world = dataclasses.replace(world, evidence=dataclasses.replace(
+            world.evidence, scale_spread=ScaleCut.from_json(verdict["scale"]).spread))
+    model.transform(to_sim3d(world.similarity))
+    folder = fresh_folder(job.out / "sparse.partial")
+    write_model(model, folder)
+    publish(folder, job.out / "sparse")
+    summary = world.summary()
+    atomic.write_json(job.out / WorldSummary.FILE, summary.to_json())
+    if verdict:
+        atomic.write_json(job.out / VERDICT, verdict)
+    return PlacedResult(world=summary)
+
+
+def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+    """Returns the camera of the undistorted image, to whose pixels --scale-between may point."""
+    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    return Pinhole(flat.width, flat.height, *flat.params)
+
+
+def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
+    """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
+    model = pycolmap.Reconstruction(job.out / SPARSE)
+    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    names = sorted(images)
+    report.phase("undistorted", len(names))
+    work = fresh_folder(job.out / "undistorted.partial")
+    views = {number: find_views(camera, partial(_counting, job, [
+        name for name in names if images[name].camera_id == number]))
+        for number, camera in model.cameras.items()}
+    if any(each[0].face is not None for each in views.values()):
+        _tell_faces(views, report)
+        sizes = write_views(job, model, work, report, views, (IMAGES, TWINS, MASKS, SPARSE))
+        publish(work, job.out / "undistorted")
+        return UndistortedResult(cameras=tuple(sizes))
+    flat = _write_model(job, model, names[0], work)
+    warps = {number: places_in(camera, flat.cameras[number])
+             for number, camera in model.cameras.items()}
+    masked = {name for name in names if job.masks and (job.masks / name).exists()}
+    for folder in (IMAGES, TWINS, *([MASKS] if masked else [])):
+        (work / folder).mkdir()
+
+    def write(name: str) -> None:
+        warp, target = warps[images[name].camera_id], work / IMAGES / name
+        write_png(target, resample(read_png(job.frames / name), warp))
+        if filecmp.cmp(job.frames / name, job.denoised / name, shallow=False):
+            shutil.copyfile(target, work / TWINS / name)
+        else:
+            write_png(work / TWINS / name, resample(read_png(job.denoised / name), warp))
+        if job.masks is not None and name in masked:  # 255 where most of a pixel counts
+            gray = resample(read_png(job.masks / name)[:, :, 0], warp)
+            write_png(work / MASKS / name, np.where(gray < 128, 0, 255).astype(np.uint8))
+
+    with ThreadPoolExecutor(job.threads) as pool:
+        for count, _ in enumerate(pool.map(write, names), 1):
+            report.done(count)
+    counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
+    cameras = tuple(
+        {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
+         "frames": counts[index]}
+        for index, camera in sorted(flat.cameras.items()))
+    publish(work, job.out / "undistorted")
+    return UndistortedResult(cameras=cameras)
+
+
+def _counting(job: MappingJob, names: Sequence[str]) -> NDArray[np.bool_] | None:  # [H, W]
+    """Returns the pixels that some mask of frames of one size leaves; None for all."""
+    if job.masks is None or not all((job.masks / name).exists() for name in names):
+        return None
+    masks = (read_png(job.masks / name)[:, :, 0] >= 128 for name in names)
+    return reduce(np.logical_or, masks)
+
+
+def _write_model(
+    job: MappingJob, model: pycolmap.Reconstruction, name: str, work: Path
+) -> pycolmap.Reconstruction:
+    """Writes the undistorted `model` into work/sparse and returns it.
+
+    COLMAP undistorts images with it, at a fifth of OpenCV's speed; it is given a single one.
+    """
+    between = work / "between"
+    pycolmap.undistort_images(between, job.out / SPARSE, job.frames, [name], num_threads=1)
+    check_model(model, between / SPARSE)
+    (between / SPARSE).rename(work / SPARSE)
+    shutil.rmtree(between)
+    return pycolmap.Reconstruction(work / SPARSE)
+
+
+def _tell_faces(views: Mapping[int, Sequence[FlatView]], report: Reporter) -> None:
+    """Gives notice of lenses whose frames are seen through faces."""
+    for number, each in sorted(views.items()):
+        face = each[0].face
+        if face is not None and not is_cube_face(view_name("x.png", face)):
+            which = "" if len(views) == 1 else f" of camera {number}"
+            report.tell(
+                f"The lens{which} is so wide that an undistorted picture would leave out more than "
+                f"{MOST_LOST:.0%} of each frame: {format_count(len(each), 'pinhole view')} of each "
+                "frame, which show all of it, are used instead.")

@@ -1,0 +1,1 @@
+"""A large scene in blocks, each trained alone, then merged."""

@@ -1,0 +1,1 @@
+"""The fit of one model: its task, state, steps, losses and densification."""

@@ -1,0 +1,1 @@
+"""Pruning: in rounds, and as a run on disk."""
