@@ -1,12 +1,12 @@
 """How well the time of sfm is told before it starts: told against took, of finished workspaces.
 
     python tests/bench/bench_sfm_estimate.py WORKSPACE... [--fit]
-
-Nothing is run: manifests record the CPU seconds of each step. Those of all steps together are told
-from the frames, their size, tracks and segments, by the costs in
-`sfm/mapping/time_estimate.py`; the seconds on two idle cores follow from the same costs. A row that needed a later mapper is marked:
-that the first falls short cannot be known before. --fit prints costs that fit the rows that are
-not marked, in relative least squares with none below zero; one that no row pays keeps its value.
+ Nothing is run: manifests record the CPU seconds of each step. Those of all steps together are told
+from the frames, their size, tracks and segments, by the costs in `sfm/mapping/time_estimate.py`;
+the seconds on two idle cores follow from the same costs. A row that needed a later mapper is
+marked: that the first falls short cannot be known before. --fit prints costs that fit the rows that
+are not marked, in relative least squares with none below zero; one that no row pays keeps its
+value.
 
 CPU seconds of a busy machine are up to twice those of an idle one, so workspaces to fit with should
 be mapped one at a time.
