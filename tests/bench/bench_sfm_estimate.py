@@ -1,7 +1,8 @@
 """How well the time of sfm is told before it starts: told against took, of finished workspaces.
 
     python tests/bench/bench_sfm_estimate.py WORKSPACE... [--fit]
- Nothing is run: manifests record the CPU seconds of each step. Those of all steps together are told
+
+Nothing is run: manifests record the CPU seconds of each step. Those of all steps together are told
 from the frames, their size, tracks and segments, by the costs in `sfm/mapping/time_estimate.py`;
 the seconds on two idle cores follow from the same costs. A row that needed a later mapper is
 marked: that the first falls short cannot be known before. --fit prints costs that fit the rows that
