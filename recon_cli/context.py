@@ -6,15 +6,18 @@ import logging
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from recon_cli.deadline import Deadline
 from recon_cli.progress import NullProgress, Progress
+from recon_cli.workspace.json_record import JsonRecord
 
 if TYPE_CHECKING:
     from recon_cli.config.stages import ComputeConfig
     from recon_cli.scene.camera import Camera
     from recon_cli.scene.splats import Splats
+
+R = TypeVar("R", bound=JsonRecord)
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,9 @@ def _leave_idle() -> None:
 
 @dataclass(frozen=True)
 class EarlierResult:
-    """The finished result that a stage replaces, where it continues it or reads edits of it."""
+    """The finished result that a stage replaces, of which it reads edits."""
 
     folder: Path
-    summary: Mapping[str, Any]  # that the stage returned then
     changed: frozenset[str] = frozenset()  # relative paths of files that were changed by hand
     missing: frozenset[str] = frozenset()  # of those that were removed
     foreign: frozenset[str] = frozenset()  # of those that the stage did not write
@@ -85,8 +87,14 @@ class StageInputs:
     sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
     continues: Path | None = None  # finished result of the stage itself that the run continues
     digests: Mapping[str, str] = field(default_factory=dict)  # of the files in each of `folders`
-    earlier: EarlierResult | None = None  # that the stage continues, if any
+    # what the stage of each of `folders` says about its result
+    summaries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    earlier: EarlierResult | None = None  # whose edits the stage reads, if any
     part: str = ""  # of the stage that is made; empty for its own result
+
+    def read_summary(self, stage: str, kind: type[R]) -> R:
+        """Returns what a stage says about its result; ManifestError for another version's."""
+        return kind.from_json(self.summaries[stage])
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
-from recon_cli.stages import STAGES, Stage
+from recon_cli.stages import STAGES, Stage, stage
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import JsonRecord
@@ -67,7 +67,8 @@ def run(config: StageConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
             ctx.record(step, STEPS)
             if seconds := os.environ.get(f"SLOW_{name.upper()}"):
                 time.sleep(float(seconds))
-    options = {key: value for key, value in config.hashed_fields().items() if key != "seed"}
+    options = {key: value for key, value in stage(name).key_options(config).items()
+               if key != "seed"}
     read = [(path / "result.txt").read_text() for path in inputs.folders.values()]
     read += [path.read_text() for path in inputs.sources if path.is_file()]
     read += [(inputs.continues / "result.txt").read_text()] if inputs.continues else []

@@ -5,9 +5,9 @@ from recon_cli.workspace.summaries import (
     DenoiseSummary,
     EvaluateSummary,
     IngestSummary,
+    PlaceSummary,
     PruneSummary,
     RoundSummary,
-    SfmSummary,
     TrainSummary,
     WorldEvidence,
     WorldSummary,
@@ -20,7 +20,7 @@ EVIDENCE = WorldEvidence(
     scale_source="arbitrary", metres=False)
 WORLD = WorldSummary(
     similarity=Similarity().to_json(), evidence=EVIDENCE, measurement=None, sentences=())
-SFM = SfmSummary(
+PLACE = PlaceSummary(
     frames=12, registered=9, points=100, mean_track_length=3.0, reprojection_error_px=0.5,
     median_triangulation_angle_deg=9.0, poses=None, models=(9,), apart=(), rejected={},
     verdict={"trusted": True}, lines=(), attempts=(), seconds={}, unregistered=(),
@@ -44,5 +44,5 @@ PRUNE = PruneSummary(
     train_seconds=2.0)
 EVALUATE = EvaluateSummary(
     test_views=3, unregistered_test=(), base_psnr_db=25.0, base_ssim=0.9, base_gaussians=50)
-BY_STAGE = {"ingest": INGEST, "denoise": DENOISE, "sfm": SFM, "train": TRAIN, "prune": PRUNE,
-            "evaluate": EVALUATE}
+BY_STAGE = {"ingest": INGEST, "denoise": DENOISE, "sfm": PLACE, "place": PLACE, "train": TRAIN,
+            "prune": PRUNE, "evaluate": EVALUATE}

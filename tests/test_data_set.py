@@ -34,7 +34,7 @@ def test_the_views_that_the_set_holds_out_are_the_ones_that_are_scored(workspace
 
 def test_nothing_was_mapped_and_the_unit_stayed(workspace):
     assert not (workspace / "sfm" / "database.db").exists()
-    world = json.loads((workspace / "sfm" / "world.json").read_text())
+    world = json.loads((workspace / "place" / "world.json").read_text())
     assert world["evidence"]["scale_source"] == "data set"
     assert world["evidence"]["metres"]
     splats = read_ply(workspace / "train" / "splats.ply")

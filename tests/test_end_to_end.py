@@ -29,7 +29,7 @@ max_size = 96
 densify_every = 10
 checkpoint_every = 5
 """
-STAGES = ("ingest", "denoise", "sfm", "train", "prune", "evaluate", "export")
+STAGES = ("ingest", "denoise", "sfm", "place", "train", "prune", "evaluate", "export")
 VERBS = {"evaluate": "eval"}
 EVERY_LINE = """
 import json, sys

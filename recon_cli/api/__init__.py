@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     from recon_cli.workspace.summaries import ExportSummary as ExportSummary
     from recon_cli.workspace.summaries import ImportSummary as ImportSummary
     from recon_cli.workspace.summaries import IngestSummary as IngestSummary
+    from recon_cli.workspace.summaries import PlaceSummary as PlaceSummary
     from recon_cli.workspace.summaries import PruneSummary as PruneSummary
-    from recon_cli.workspace.summaries import SfmSummary as SfmSummary
     from recon_cli.workspace.summaries import TrainSummary as TrainSummary
 
 # Each module and the public names that are loaded from it, in the order of docs/api.md.
@@ -82,7 +82,7 @@ _PUBLIC: dict[str, tuple[str, ...]] = {
         "StageResult", "IngestResult", "SfmResult", "ModelResult", "TrainingCurve",
         "EvaluateResult", "ExportResult", "View"),
     "recon_cli.workspace.summaries": (
-        "IngestSummary", "DenoiseSummary", "SfmSummary", "TrainSummary", "ImportSummary",
+        "IngestSummary", "DenoiseSummary", "PlaceSummary", "TrainSummary", "ImportSummary",
         "PruneSummary", "EvaluateSummary", "ExportSummary"),
     "recon_cli.pipeline.plan": ("StageStatus",),
     "recon_cli.config.stages": (

@@ -18,6 +18,7 @@ from recon_cli.datasets.layouts import read_posed
 from recon_cli.errors import FormatError, InputError, list_names
 from recon_cli.io.calibration import ORTHONORMAL, viewmat_from_pose
 from recon_cli.scene.camera import MODELS, Camera, Lens, looking_at
+from recon_cli.workspace.layout import Workspace
 
 _POSE_HINT = "Give a rotation with a translation, without scale: [4, 4], last row 0 0 0 1."
 
@@ -101,7 +102,7 @@ def read_cameras(path: str | Path, *, ignore_distortion: bool = False) -> dict[s
         FormatError: it is damaged.
     """
     path = Path(path)
-    undistorted = path / "sfm" / "undistorted" / "sparse"
+    undistorted = Workspace(path).folder("place") / "undistorted" / "sparse"
     listed = _list_cameras(undistorted if undistorted.is_dir() else path)
     distorted = [name for name, lens, _ in listed if _is_distorted(lens)]
     if distorted and not ignore_distortion:

@@ -19,7 +19,7 @@ from recon_cli.workspace.summaries import (
     ExportSummary,
     IngestSummary,
     LogRow,
-    SfmSummary,
+    PlaceSummary,
 )
 
 if TYPE_CHECKING:  # they import torch, SciPy or pycolmap
@@ -59,7 +59,7 @@ class IngestResult(StageResult[IngestSummary]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SfmResult(StageResult[SfmSummary]):
+class SfmResult(StageResult[PlaceSummary]):
     """Cameras of the undistorted views, and sparse points."""
 
     @cached_property

@@ -25,6 +25,7 @@ from recon_cli.api.results import (
 from recon_cli.api.runs import OpenWorkspace, RunRequest, check_settings, make_options
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.fields import StageConfig
+from recon_cli.config.settings import section_of
 from recon_cli.config.stages import (
     ComputeConfig,
     DenoiseConfig,
@@ -42,6 +43,7 @@ from recon_cli.pipeline.execute import Job
 from recon_cli.pipeline.plan import StageStatus
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.stages import IMPORT, STAGES, Stage
+from recon_cli.workspace import layout
 from recon_cli.workspace.paths import refuse_special
 from recon_cli.workspace.summaries import (
     DenoiseSummary,
@@ -114,7 +116,7 @@ class Workspace:
         self, *, config: SfmConfig | None = None, again: bool = False, **options: Any
     ) -> SfmResult:
         """Estimates cameras and a sparse point cloud; denoise runs first where needed."""
-        return self._run(SfmResult, _row("sfm"), config, options, again=again)
+        return self._run(SfmResult, _row("place"), config, options, again=again)
 
     def train(
         self, *, config: TrainConfig | None = None, again: bool = False, from_import: bool = False,
@@ -193,7 +195,7 @@ class Workspace:
 
         Raises:
             InputError: there is no such split.
-            StageError: ingest or sfm is missing or stale.
+            StageError: ingest, sfm or place is missing or stale.
         """
         from recon_cli.io.training_scene import load_scene
         from recon_cli.io.views import load_views
@@ -204,12 +206,12 @@ class Workspace:
             raise InputError(f"There is no split {split!r}.",
                              hint="Ask for train, validation or test.")
         job, config = self._open.open_job(TrainConfig)
-        plan.require(job.inspect(), ("ingest", "sfm"), "views")
+        plan.require(job.inspect(), ("ingest", "place"), "views")
         folder = job.workspace.folder
         trained = job.workspace.manifest("train") is not None
         run_config = read_config(folder("train")) if trained else None
         scene = load_scene(
-            {name: folder(name) for name in ("ingest", "sfm")},
+            {name: folder(name) for name in ("ingest", "place")},
             validation=config.validation if run_config is None else run_config.validation)
         size = max_size or (run_config.max_size if run_config else
                             config.max_size or QUALITIES[config.quality].max_size)
@@ -225,13 +227,14 @@ class Workspace:
         callbacks: Sequence[TrainCallback] = (),
     ) -> R:
         """Brings one stage up to date and returns its result."""
-        section = "import" if row is IMPORT else row.name
+        section = section_of(row.config)
         paths = tuple(Path(source) for source in sources)
         for path in paths:
             refuse_special(path)
         table = tuple(row if other.name == row.name else other for other in STAGES)
+        stages = tuple(other.name for other in table if other.verb == row.verb)
         request = RunRequest(
-            row.verb, (row.name,), paths, options=make_options(config, options, section),
+            row.verb, stages, paths, options=make_options(config, options, section),
             again=again, from_import=from_import, callbacks=tuple(callbacks), table=table)
         with _collecting_notices() as notices, _keeping_threads(row):
             outcomes = self._open.run(request)
@@ -239,9 +242,10 @@ class Workspace:
         run = outcome.manifest.run
         earlier = () if outcome.ran else run.summary.get("notices") or ()
         return kind(
-            stage=row.name, folder=self.path / row.name,
-            ran=any(one.ran for one in outcomes if one.stage.partition(".")[0] == row.name),
-            seconds=run.seconds, summary=row.summary.from_json(run.summary),
+            stage=row.name, folder=layout.Workspace(self.path).folder(row.name),
+            ran=any(one.ran for one in outcomes if one.stage.partition(".")[0] in stages),
+            seconds=sum(one.manifest.run.seconds for one in outcomes if one.stage in stages),
+            summary=row.summary.from_json(run.summary),
             notices=(*notices, *earlier))
 
 

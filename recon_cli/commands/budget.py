@@ -85,7 +85,7 @@ def run_within(
     write_json(workspace.root / FILE, budget.to_json())  # now that there is a folder
     call.deadline = Deadline(_SFM * left(), clock)
     _report_frames(workspace, budget, call.deadline.seconds, threads, slowness)
-    stages("denoise", "sfm", frames=frames)
+    stages("denoise", "sfm", "place", frames=frames)
     if budget.train_minutes is None:
         pruning = left() * _PRUNE / (1 + _PRUNE)
         prune = with_prune and pruning >= _LEAST_PRUNING * slowness

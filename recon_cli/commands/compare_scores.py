@@ -75,8 +75,8 @@ def _load_held_out(
     job: Job, config: EvaluateConfig
 ) -> tuple[str, list[ReferenceView], StageContext]:
     """Returns the name of the workspace of -w, its held-out views, and where to render them."""
-    plan.require(job.inspect(), ("ingest", "sfm"), "eval")
-    inputs = StageInputs({name: job.workspace.folder(name) for name in ("ingest", "sfm")})
+    plan.require(job.inspect(), ("ingest", "place"), "eval")
+    inputs = StageInputs({name: job.workspace.folder(name) for name in ("ingest", "place")})
     max_size = config.max_size
     if max_size is None:
         trained = job.inspect().check("train").usable

@@ -27,7 +27,7 @@ from recon_cli.pipeline.execute import Job, Outcome
 from recon_cli.pipeline.plan import check_parts
 from recon_cli.progress import TqdmProgress, format_duration, format_megabytes
 from recon_cli.stages import STAGES, Stage
-from recon_cli.workspace.summaries import ExportSummary, SfmSummary
+from recon_cli.workspace.summaries import ExportSummary, PlaceSummary
 
 logger = logging.getLogger("recon")
 
@@ -121,10 +121,11 @@ def end_run(call: Call, *, open_page: bool = False) -> None:
     for name, path in (("scene", folder / export.file), ("page", page), ("report", report)):
         if path is not None:
             click.echo(f"{name + ':':9}{path} ({format_megabytes(path.stat().st_size)})")
-    sfm = job.workspace.manifest("sfm")
+    place = job.workspace.manifest("place")
     ingest = job.workspace.folder("ingest")
     quality = read_quality(
-        job.workspace.folder("evaluate"), SfmSummary.from_json(sfm.run.summary) if sfm else None,
+        job.workspace.folder("evaluate"),
+        PlaceSummary.from_json(place.run.summary) if place else None,
         read_frame_list(ingest).frames)
     click.echo(f"quality: {name_photos(ingest)(str(quality))}")
     click.echo(f"next:    {_next_command(call.workspace, page)}")

@@ -19,6 +19,7 @@ from recon_cli.workspace.summaries import (
     ImportSummary,
     IngestSummary,
     JsonRecord,
+    PlaceSummary,
     PruneSummary,
     SfmSummary,
     TrainSummary,
@@ -61,14 +62,23 @@ def _(denoise: DenoiseSummary) -> str:
 
 @describe.register
 def _(sfm: SfmSummary) -> str:
-    if sfm.trusted is None:
-        trust = "the poses of the data set are used" if sfm.poses else ""
-    else:
-        trust = f"the model is {'' if sfm.trusted else 'NOT '}trusted"
+    mapped = sum(len(part.names) for part in sfm.parts)
     return _join([
-        f"{sfm.registered:,} of {sfm.frames:,} frames placed",
-        f"this is part {sfm.part} of {len(sfm.parts)}" if sfm.part is not None else "",
-        f"{len(sfm.left_out):,} left out" if sfm.left_out else "", trust])
+        f"{mapped:,} of {sfm.frames:,} frames mapped",
+        f"{len(sfm.parts)} parts" if len(sfm.parts) > 1 else "",
+        f"{len(sfm.left_out):,} left out" if sfm.left_out else ""])
+
+
+@describe.register
+def _(cameras: PlaceSummary) -> str:
+    if cameras.trusted is None:
+        trust = "the poses of the data set are used" if cameras.poses else ""
+    else:
+        trust = f"the model is {'' if cameras.trusted else 'NOT '}trusted"
+    return _join([
+        f"{cameras.registered:,} of {cameras.frames:,} frames placed",
+        f"this is part {cameras.part} of {len(cameras.parts)}" if cameras.part is not None else "",
+        f"{len(cameras.left_out):,} left out" if cameras.left_out else "", trust])
 
 
 @describe.register

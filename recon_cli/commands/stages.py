@@ -63,7 +63,7 @@ def denoise(call: Call) -> None:
 @pass_call
 def sfm(call: Call) -> None:
     """Estimate cameras and a sparse point cloud."""
-    run_stages(call, "sfm", ["sfm"])
+    run_stages(call, "sfm", ["sfm", "place"])
 
 
 @verb("train")

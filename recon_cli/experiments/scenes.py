@@ -31,12 +31,12 @@ from recon_cli.train.plan import choose_parts
 from recon_cli.workspace.digests import digest_file, sha256_json
 from recon_cli.workspace.layout import Workspace
 
-_READ = ("images", "denoised", "masks", "sparse")  # the inputs of training, below sfm/undistorted
+_READ = ("images", "denoised", "masks", "sparse")  # the inputs of training, below place/undistorted
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFolders:
-    """The folders of ingest and sfm of a scene, and its name in tables and files."""
+    """The folders of ingest and place of a scene, and its name in tables and files."""
 
     name: str
     inputs: StageInputs
@@ -44,7 +44,7 @@ class SceneFolders:
     @cached_property
     def digest(self) -> str:
         """Digest of the scene's images, masks, cameras and split, not of its name."""
-        undistorted = self.inputs.folders["sfm"] / "undistorted"
+        undistorted = self.inputs.folders["place"] / "undistorted"
         files = [path for part in _READ for path in sorted((undistorted / part).rglob("*"))
                  if path.is_file()]
         return sha256_json({
@@ -75,7 +75,8 @@ def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
         scenes[name] = path
         if Workspace(path).holds_results:
             plan.require(
-                Job(Workspace(path)).inspect(), ("ingest", "sfm"), f"a scene of {path}", fresh=True)
+                Job(Workspace(path)).inspect(), ("ingest", "place"), f"a scene of {path}",
+                fresh=True)
             continue
         if not path.exists():
             raise InputError(f"{path} does not exist.", hint="Check the path.")
@@ -100,9 +101,9 @@ def open_scene(
         stages = {part: values[part] for part in ("ingest", "denoise", "sfm")}
         plan.run(Job(workspace, stages, compute, progress), "ingest and sfm", [
             Target("ingest", build(IngestConfig, stages), (path,)),
-            Target("sfm", build(SfmConfig, stages))])
+            *(Target(name, build(SfmConfig, stages)) for name in ("sfm", "place"))])
     return SceneFolders(name, StageInputs({
-        stage: workspace.folder(stage) for stage in ("ingest", "sfm")}))
+        stage: workspace.folder(stage) for stage in ("ingest", "place")}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,7 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
     similarity = Similarity()
     if measurement is not None:
         fused = fuse_measured(measurement.scale, measurement.error, _known_sources(
-            WorldSummary.read(inputs.folders["sfm"])))
+            WorldSummary.read(inputs.folders["place"])))
         assert fused.scale is not None  # what the user measured decides
         similarity = Similarity(scale=fused.scale)
     up = _find_up(inputs, warn=config.up is not None)
@@ -81,7 +81,7 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
 
 def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
     """Returns the frame for measures; StageError if scale or up is unknown: none is guessed."""
-    world = WorldSummary.read(inputs.folders["sfm"])
+    world = WorldSummary.read(inputs.folders["place"])
     source = world.evidence.scale_source if world else ARBITRARY
     if frame.fused is None and source == ARBITRARY:
         raise StageError(
@@ -101,7 +101,7 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
         error = float(np.hypot(error, world.evidence.scale_spread))
     if world and world.evidence.up_found:
         return RoomFrame(frame.similarity.rotation @ np.array(UP["z"]), error)
-    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    sparse = inputs.folders["place"] / "undistorted" / "sparse"
     points, _ = read_points(sparse / "points3D.bin")
     gravity = find_gravity(
         points, np.stack([viewmat for _, _, viewmat in read_images(sparse / "images.bin")]))
@@ -115,7 +115,7 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
 def _measure_scale(config: ExportConfig, inputs: StageInputs) -> Measurement | None:
     if config.scale_between is None:
         return None
-    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    sparse = inputs.folders["place"] / "undistorted" / "sparse"
     points, _ = read_points(sparse / "points3D.bin")
     viewmats = {name: viewmat for name, _, viewmat in read_images(sparse / "images.bin")}
     a, b = find_frames(inputs.folders["ingest"], config.scale_between[:2])
@@ -144,10 +144,10 @@ def _find_up(inputs: StageInputs, *, warn: bool) -> NDArray[np.float64]:
     record = ImportRecord.read(inputs.folders["train"])
     if record and not has_views(inputs.folders):
         return record.up()
-    world = WorldSummary.read(inputs.folders["sfm"])
+    world = WorldSummary.read(inputs.folders["place"])
     if world and world.evidence.up_found:
         return np.array(UP["z"])
-    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    sparse = inputs.folders["place"] / "undistorted" / "sparse"
     viewmats = np.stack([viewmat for _, _, viewmat in read_images(sparse / "images.bin")])
     if warn:
         logger.warning("up was not found, so --up uses the mean up of the cameras")

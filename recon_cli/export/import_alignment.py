@@ -59,17 +59,17 @@ class Alignment:
                 f"{self.flat_db:.1f} dB")
 
 
-def read_world(sfm: Path) -> Similarity:
+def read_world(place: Path) -> Similarity:
     """Returns the similarity from the world of the capture's cameras to that of the workspace.
 
-    `sfm` is the finished folder of the stage; FormatError if its record is damaged.
+    `place` is the finished folder of the stage; FormatError if its record is damaged.
     """
-    world = WorldSummary.read(sfm)
+    world = WorldSummary.read(place)
     try:
         return Similarity.from_json(world.similarity) if world else Similarity()
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{sfm / WorldSummary.FILE} holds no similarity: {error}.",
+            f"{place / WorldSummary.FILE} holds no similarity: {error}.",
             hint="Run `recon sfm --again`.") from error
 
 

@@ -120,14 +120,14 @@ class ExportSource:
     @cached_property
     def in_metres(self) -> bool:
         """Whether the capture came with metres, and the scene of the training is in metres."""
-        world, poses = WorldSummary.read(self._inputs.folders["sfm"]), self.ingest / POSES
+        world, poses = WorldSummary.read(self._inputs.folders["place"]), self.ingest / POSES
         return bool(world and world.evidence.metres and poses.exists()
                     and read_poses(poses).metric)
 
     @property
     def known_up(self) -> NDArray[np.float64] | None:
         """Up [3] in the world of the files, None where it is a guess."""
-        world = WorldSummary.read(self._inputs.folders["sfm"])
+        world = WorldSummary.read(self._inputs.folders["place"])
         return self.frame.up if world and world.evidence.up_found else None
 
     @property

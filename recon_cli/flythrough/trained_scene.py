@@ -23,9 +23,9 @@ from recon_cli.train.fit.train_data import read_config
 from recon_cli.trust.scene_trust import digest_of
 from recon_cli.workspace.manifest import Manifest
 from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import PlaceSummary
 
-_NEEDS = ("ingest", "train", "sfm")  # training runs sfm first where that is missing too
+_NEEDS = ("ingest", "train", "place")  # training runs place first where that is missing too
 
 logger = logging.getLogger("recon")
 
@@ -87,17 +87,17 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
     else:
         inputs = StageInputs({name: folder(name) for name in _NEEDS})
         scene = load_scene(inputs.folders, validation=config.validation)
-        z_up, metres = _read_world(manifests["sfm"])
+        z_up, metres = _read_world(manifests["place"])
     return TrainedScene(
         "pruned" if pruned else "base", splats, digest_of(splats), config.sh_degree,
         config.max_size, scene, z_up, metres,
         assumed_up=origin.up() if origin is not None and viewless else None)
 
 
-def _read_world(sfm: Manifest) -> tuple[bool, bool]:
+def _read_world(place: Manifest) -> tuple[bool, bool]:
     """Returns whether z is up and a unit is a metre; no, where another version's record differs."""
     try:
-        evidence = SfmSummary.from_json(sfm.run.summary).world.evidence
+        evidence = PlaceSummary.from_json(place.run.summary).world.evidence
     except ManifestError:
         return False, False
     return evidence.up_found, evidence.metres

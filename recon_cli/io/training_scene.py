@@ -1,4 +1,4 @@
-"""The scene as sfm left it: its views and points, split by their permitted use."""
+"""The scene as place left it: its views and points, split by their permitted use."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ def held_out_names(ingest: Path) -> frozenset[str]:
 def load_scene(
     folders: Mapping[str, Path], *, validation: float | frozenset[str], sparse: Path | None = None
 ) -> Scene:
-    """Returns the views and points that sfm left, split by their permitted use.
+    """Returns the views and points that place left, split by their permitted use.
 
-    `folders` are those of ingest and sfm. `validation` are the names of views to look at only, or
+    `folders` are those of ingest and place. `validation` are the names of views to look at only, or
     their share; `sparse` is the folder of a model with a part of the views and points.
     """
-    sfm, held_out = folders["sfm"], held_out_names(folders["ingest"])
+    place, held_out = folders["place"], held_out_names(folders["ingest"])
     scene = read_scene(
-        sfm / "undistorted", held_out=held_out, validation=validation, sparse=sparse)
-    world = WorldSummary.read(sfm)
+        place / "undistorted", held_out=held_out, validation=validation, sparse=sparse)
+    world = WorldSummary.read(place)
     up = np.array([0.0, 0.0, 1.0]) if world is not None and world.evidence.up_found else None
     ingest = folders["ingest"]
     return dataclasses.replace(

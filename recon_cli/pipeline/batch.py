@@ -23,8 +23,8 @@ from recon_cli.workspace.summaries import JsonRecord
 FILE = "batch.json"
 _VERSION = 1
 # Percent of a run by its end, on the demo's room
-_DONE_AFTER = {"ingest": 4, "denoise": 6, "sfm": 32, "train": 76, "prune": 96, "evaluate": 99,
-               "export": 100}
+_DONE_AFTER = {"ingest": 4, "denoise": 6, "sfm": 30, "place": 32, "train": 76, "prune": 96,
+               "evaluate": 99, "export": 100}
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def _read_result(capture: Capture, code: int | None, reason: str) -> CaptureResu
               for key, value in fresh.get("evaluate", {}).items()}
     return dataclasses.replace(
         result, frames=fresh.get("ingest", {}).get("frames"),
-        registered=fresh.get("sfm", {}).get("registered"), psnr_db=scores.get("psnr_db"),
+        registered=fresh.get("place", {}).get("registered"), psnr_db=scores.get("psnr_db"),
         ssim=scores.get("ssim"), gaussians=export.get("gaussians"), bytes=export.get("bytes"),
         seconds=round(sum(stage.seconds or 0.0 for stage in stages if stage.name in fresh), 1))
 

@@ -93,7 +93,7 @@ def run_stage(
         tuple(Path(source.path) for source in sources),
         workspace.folder(row.name) if key.continues else None,
         {name: digest for name, digest in key.upstream.items() if digest},
-        _find_earlier(workspace, row, key, again=again), row.part)
+        checks.summaries(row), _find_earlier(workspace, row), row.part)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
     from recon_cli.workspace.records import name_photos  # imports numpy
@@ -120,17 +120,14 @@ def run_stage(
     return manifest
 
 
-def _find_earlier(
-    workspace: Workspace, row: Stage, key: ResultKey, *, again: bool
-) -> EarlierResult | None:
-    """Returns the result whose edits a stage reads, or that it continues: late options differ."""
+def _find_earlier(workspace: Workspace, row: Stage) -> EarlierResult | None:
+    """Returns the result whose edits a stage reads."""
     folder = workspace.folder(row.name)
     try:
         finished = workspace.manifest(row.name)
     except ManifestError:
         return None
-    if finished is None or not (row.edits or (row.late and not again and (
-            _without(finished.key, row.late) == _without(key, row.late)))):
+    if finished is None or not row.edits:
         return None
     present = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")
                if path.is_symlink() or not path.is_dir()}
@@ -138,15 +135,9 @@ def _find_earlier(
                if (known := finished.outputs.get(name)) is not None
                and (not path.is_file() or digest_file(path, known).sha256 != known.sha256)}
     return EarlierResult(
-        folder, finished.run.summary, frozenset(changed),
+        folder, frozenset(changed),
         frozenset(finished.outputs.keys() - present.keys()),
         frozenset(present.keys() - finished.outputs.keys() - {MANIFEST}))
-
-
-def _without(key: ResultKey, options: Sequence[str]) -> str:
-    """Returns the fingerprint of a key without some of its options."""
-    return dataclasses.replace(key, config={
-        name: value for name, value in key.config.items() if name not in options}).fingerprint
 
 
 @contextmanager

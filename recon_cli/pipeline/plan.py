@@ -246,14 +246,17 @@ def _need_error(checks: WorkspaceCheck, check: StageCheck, reader: str) -> Stage
 def command(checks: WorkspaceCheck, check: StageCheck) -> str:
     """Returns the command that brings a stage up to date with the options it had."""
     words = ["recon", check.row.verb]
-    latest = check.partial_run or check.manifest
-    if latest is None:
+    found = [(one.row, latest) for one in checks.siblings(check.row)
+             if (latest := one.partial_run or one.manifest)]
+    if not found:
         return " ".join([*words, check.row.input_metavar] if check.row.input_metavar else words)
-    config, default = checks.config(check.row, latest.key), checks.config(check.row, None)
-    for item in dataclasses.fields(check.row.config):
-        value, info = getattr(config, item.name), option_info(item)
-        if value not in (None, getattr(default, item.name)) and info.hashed:
-            words += _option_words(item.name, value, info)
+    for row, latest in found:
+        config, default = checks.config(row, latest.key), checks.config(row, None)
+        for item in dataclasses.fields(row.config):
+            value, info = getattr(config, item.name), option_info(item)
+            if (value not in (None, getattr(default, item.name)) and info.hashed
+                    and (row.options is None or item.name in row.options)):
+                words += _option_words(item.name, value, info)
     return shlex.join(words)
 
 

@@ -29,7 +29,7 @@ from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.workspace.records import FOLDER, Frame, describe_stretches, read_frame_list
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import PlaceSummary
 
 _SHEETS = 4  # contact sheets on the page; a capture may have many sources
 _THUMBS, _THUMB_SIDE, _THUMB_QUALITY = 24, 220, 72
@@ -89,12 +89,12 @@ def read_capture(stages: StageReports) -> CaptureSection:
     except (FormatError, OSError) as error:
         damaged.append(f"Masked areas are not shown: {error}")
     scene = None
-    if stages["sfm"].there and frames:
+    if stages["place"].there and frames:
         try:
             scene = _read_scene(stages, frames)
         except (FormatError, OSError) as error:
             damaged.append(f"The plan is not shown: {error}")
-    sfm = stages["sfm"].read_summary(SfmSummary)
+    sfm = stages["place"].read_summary(PlaceSummary)
     left_out = sfm.left_out if sfm else ()
     plan, notes = _draw_plan(scene, sfm, read_regions(stages)) if scene else (None, ())
     by_name = {view.frame: part for part, views in by_part(scene).items()
@@ -123,13 +123,13 @@ def _read_scene(stages: StageReports, frames: Sequence[Frame]) -> Scene:
     train = stages["train"].manifest
     share = train.key.config.get("validation") if train else None
     return read_scene(
-        stages["sfm"].folder / "undistorted",
+        stages["place"].folder / "undistorted",
         held_out=frozenset(frame.name for frame in frames if frame.held_out),
         validation=TrainConfig.validation if share is None else float(share))
 
 
 def _draw_plan(
-    scene: Scene, sfm: SfmSummary | None, regions: Sequence[PoorlySeenRegion]
+    scene: Scene, sfm: PlaceSummary | None, regions: Sequence[PoorlySeenRegion]
 ) -> tuple[Markup, tuple[str, ...]]:
     """Returns the floor plan and notes on it."""
     metres = sfm is not None and sfm.world.evidence.metres

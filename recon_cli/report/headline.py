@@ -14,7 +14,7 @@ from recon_cli.report.records import BASE, PRUNED
 from recon_cli.report.stage_status import StageReport, StageReports
 from recon_cli.trust.quality import delivered_model, find_doubtful_cameras
 from recon_cli.trust.scene_trust import TrustRecord
-from recon_cli.workspace.summaries import IngestSummary, PruneSummary, SfmSummary, TrainSummary
+from recon_cli.workspace.summaries import IngestSummary, PlaceSummary, PruneSummary, TrainSummary
 
 _KINDS = {
     "video": "a video", "photos": "photos", "mixed": "videos and photos",
@@ -67,14 +67,14 @@ def build_headline(
     return Headline(
         _KINDS.get(kind, kind), tuple(Path(source.path).name for source in sources),
         tuple(_build_tiles(stages, metrics, trust)),
-        judge_poses(stages["sfm"], find_doubtful_cameras(metrics)), ingest.gone)
+        judge_poses(stages["place"], find_doubtful_cameras(metrics)), ingest.gone)
 
 
-def judge_poses(sfm: StageReport, failed: Sequence[ViewScore] = ()) -> PosesVerdict:
-    """Returns the verdict of sfm on its own result, unless views that failed contradict it."""
-    if not sfm.there:
+def judge_poses(place: StageReport, failed: Sequence[ViewScore] = ()) -> PosesVerdict:
+    """Returns the verdict of sfm on the cameras, unless views that failed contradict it."""
+    if not place.there:
         return PosesVerdict("unknown", "There are no camera poses yet.")
-    summary = sfm.read_summary(SfmSummary)
+    summary = place.read_summary(PlaceSummary)
     if summary is None:
         return PosesVerdict("unknown", "The camera poses are from another version of recon.")
     count = f"{summary.registered:,} of {summary.frames:,} frames have a camera"
@@ -116,9 +116,10 @@ def judge_poses(sfm: StageReport, failed: Sequence[ViewScore] = ()) -> PosesVerd
 def _build_tiles(
     stages: StageReports, metrics: Metrics | None, trust: TrustRecord | None
 ) -> Iterator[Tile]:
-    ingest, sfm, train, prune = (stages[name] for name in ("ingest", "sfm", "train", "prune"))
+    ingest, place, train, prune = (
+        stages[name] for name in ("ingest", "place", "train", "prune"))
     yield from _score_tiles(stages["evaluate"], metrics, trust)
-    frames, cameras = ingest.read_summary(IngestSummary), sfm.read_summary(SfmSummary)
+    frames, cameras = ingest.read_summary(IngestSummary), place.read_summary(PlaceSummary)
     detail = (f"{frames.width}x{frames.height}, {frames.held_out:,} held out" if frames
               else "cannot be read")
     if cameras and cameras.part is not None:
@@ -127,7 +128,7 @@ def _build_tiles(
         detail += f", {len(cameras.left_out):,} left out"
     if cameras:
         yield Tile("cameras", f"{cameras.registered:,} of {cameras.frames:,}", detail,
-                   not (sfm.fresh and ingest.fresh))
+                   not (place.fresh and ingest.fresh))
     else:
         yield Tile("frames", f"{frames.frames:,}" if frames else _LACKING, detail, not ingest.fresh)
     model = prune if prune.there else train

@@ -44,7 +44,7 @@ def read_moving(stages: StageReports) -> Moving | None:
                 f"views were masked in training, as they move{by_hand}. The masks are in "
                 f"train/{FOLDER}: edit or remove them, or add others, and train again.")
     pictures, notes = [], []
-    images = stages["sfm"].folder / "undistorted" / "images"
+    images = stages["place"].folder / "undistorted" / "images"
     order = sorted(summary.shares.items(), key=lambda item: (-item[1], item[0]))
     for name, share in order[:_PICTURES]:
         stem = name.rsplit(".", 1)[0]

@@ -21,7 +21,7 @@ from recon_cli.trust.quality import Quality, delivered_model, describe_quality, 
 from recon_cli.trust.scene_trust import TrustRecord
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.records import FOLDER, Frame, read_frame_list
-from recon_cli.workspace.summaries import ExportedFile, ExportSummary, SfmSummary
+from recon_cli.workspace.summaries import ExportedFile, ExportSummary, PlaceSummary
 
 _SIDE, _QUALITY = 1280, 86
 
@@ -62,7 +62,7 @@ def build_opening(stages: StageReports, metrics: Metrics | None, page: Path) -> 
     except FormatError:  # which the section on trust says
         trust = None
     picture, caption = _find_picture(stages, metrics, frames)
-    quality = describe_quality(metrics, trust, stages["sfm"].read_summary(SfmSummary), frames)
+    quality = describe_quality(metrics, trust, stages["place"].read_summary(PlaceSummary), frames)
     return Opening(
         _find_name(stages), picture, caption, quality, trust, not stages["evaluate"].fresh,
         tuple(_link_files(stages["export"], page)))

@@ -23,7 +23,7 @@ from recon_cli.report.stage_status import StageReports
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.workspace.records import FOLDER, Frame, read_frame_list
-from recon_cli.workspace.summaries import PartSummary, SfmSummary
+from recon_cli.workspace.summaries import PartSummary, PlaceSummary
 
 _MOST = 12  # parts on the page
 MARGIN = 2.0  # seconds to film before and after a moment, so that the new film ties to both parts
@@ -67,8 +67,8 @@ class Parts:
 
 def read_parts(stages: StageReports) -> Parts:
     """Returns the parts of a workspace's capture, as far as they can be read."""
-    sfm = stages["sfm"].read_summary(SfmSummary) if stages["sfm"].there else None
-    if sfm is None or len(sfm.parts) < 2:
+    cameras = stages["place"].read_summary(PlaceSummary) if stages["place"].there else None
+    if cameras is None or len(cameras.parts) < 2:
         return Parts()
     ingest, damaged = stages["ingest"].folder, []
     try:
@@ -76,23 +76,25 @@ def read_parts(stages: StageReports) -> Parts:
         frames = known.frames
         panoramas = any(group.lens is not None and group.lens.is_panorama for group in known.groups)
         moments = tuple(_read_moment(ingest, gap, panoramas=panoramas)
-                        for gap in find_moments(frames, sfm.parts))
+                        for gap in find_moments(frames, cameras.parts))
     except (FormatError, OSError) as error:
         return Parts(damaged=(f"The parts of the capture are not shown: {error}",))
     views = []
-    for number, part in list(enumerate(sfm.parts, 1))[:_MOST]:
-        placed, plan = number == sfm.part, None
+    for number, part in list(enumerate(cameras.parts, 1))[:_MOST]:
+        placed, plan = number == cameras.part, None
         try:
-            folder = stages["sfm"].folder / ("sparse" if placed else f"parts/{number}")
-            up_found = placed and sfm.world.evidence.up_found
+            folder = (stages["place"].folder / "sparse" if placed
+                      else stages["sfm"].folder / f"parts/{number}")
+            up_found = placed and cameras.world.evidence.up_found
             plan = _draw_part(folder, frames, up_found=up_found)
         except (FormatError, OSError) as error:
             damaged.append(f"Part {number} is not drawn: {error}")
         views.append(PartView(
-            number, placed, f"{len(part.names):,} of {sfm.frames:,} frames, {part.points:,} points",
-            describe_time(frames, sfm.parts, number), plan))
+            number, placed,
+            f"{len(part.names):,} of {cameras.frames:,} frames, {part.points:,} points",
+            describe_time(frames, cameras.parts, number), plan))
     return Parts(tuple(views), moments, any(frame.time_seconds is not None for frame in frames),
-                 len(sfm.parts) - len(views), tuple(damaged))
+                 len(cameras.parts) - len(views), tuple(damaged))
 
 
 def _draw_part(model: Path, frames: Sequence[Frame], *, up_found: bool) -> Markup:

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO, ClassVar, TypeVar
 
 from recon_cli.errors import (
     ConfigError,
@@ -30,12 +30,13 @@ from recon_cli.workspace.journal import crc32
 from recon_cli.workspace.json_record import JsonRecord
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
+PLACED = "placed.json"  # in the folder of place, until the parent reads it: `PlacedPart`
 DATABASE = "database.db"  # in the stage's folder: COLMAP's, of features and matches
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 POLL_SECONDS = 0.25  # between looks at what native code has done
 CLIP_SECONDS = 1e6  # from the start of a clip to that of the next, in the times of a job
 LOG_FILE = "steps.json"  # in the stage's folder: the finished steps
-STEPS = ("features", "matches", "model", "sparse", "undistorted")
+STEPS = ("features", "matches", "model")
 SPLIT = "split"  # a step after the matches where a view graph is cut into segments
 _SELF = "self"  # in the log, beside the steps: its own checksum
 _ORDER = (*STEPS[:2], SPLIT, *STEPS[2:])
@@ -58,7 +59,6 @@ class MappingJob(JsonRecord):
     """One run of the mapping process; see `SfmConfig` for the options."""
 
     frames: Path  # folder of the original frames; features are found in these
-    denoised: Path  # folder of their denoised twins, under the same names
     out: Path  # the stage's folder
     groups: tuple[CameraGroup, ...]
     masks: Path | None  # folder of masks under the names of the frames; 0 is ignored
@@ -70,8 +70,6 @@ class MappingJob(JsonRecord):
     min_registered: float
     accept_weak: bool
     partial: bool
-    gravity: bool
-    scale_between: tuple[str, str, float] | None
     max_minutes: float
     seed: int
     threads: int
@@ -82,7 +80,7 @@ class MappingJob(JsonRecord):
     # names of the frames of each segment that was mapped apart, in folders of `segments`
     segments: tuple[tuple[str, ...], ...] = ()
     split: int = 0  # segments to cut the view graph into; none where 0
-    part: int = 1  # of the capture, which is placed; 1 shows most
+    is_segment: bool = False  # of a longer capture
     last: str = STEPS[-1]  # the last step to take
     # after which a model that can be trusted is not sought to be improved; None: --max-minutes
     spare_minutes: float | None = None
@@ -112,7 +110,7 @@ class MappingJob(JsonRecord):
 
         None in a segment: segments are joined by the intrinsics that all have.
         """
-        return () if self.last == "model" else tuple(
+        return () if self.is_segment else tuple(
             number for number, group in enumerate(self.groups, 1) if group.lens is None)
 
     @property
@@ -149,7 +147,7 @@ class MappingJob(JsonRecord):
         """Those of `STEPS` that this job takes; known cameras and points need no features."""
         keep = self.known_poses and self.pose_use == "keep"
         if keep and self.given_points and all(group.lens for group in self.groups):
-            return ("model", "sparse", "undistorted")
+            return STEPS[-1:]
         steps = [step for step in _ORDER if step != SPLIT or self.split]
         return tuple(steps[:steps.index(self.last) + 1])
 
@@ -166,6 +164,32 @@ class MappingJob(JsonRecord):
             raise FormatError(
                 f"{path} is not a mapping job: {error.message}.",
                 hint="`recon sfm` writes the jobs of segments; give it one of those.") from error
+
+
+@dataclass(frozen=True)
+class PlaceJob(JsonRecord):
+    """One part of a capture, to be moved into the world frame and undistorted."""
+
+    steps: ClassVar = ("undistorted",)  # that take long
+
+    frames: Path  # folder of the original frames
+    denoised: Path  # folder of their denoised twins, under the same names
+    masks: Path | None  # folder of masks under the names of the frames
+    models: Path  # folder of the models of the parts by number, in the mapper's own frame
+    out: Path  # the stage's folder
+    parts: tuple[tuple[str, ...], ...]  # names of the frames of each part; 1 shows most
+    poses: Path | None  # file of known poses, where they were used
+    pose_use: str  # how they were, see `PosesSummary`
+    part: int
+    gravity: bool
+    scale_between: tuple[str, str, float] | None
+    accept_weak: bool
+    threads: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """File names of the frames that are placed, sorted."""
+        return self.parts[self.part - 1]
 
 
 Record = TypeVar("Record", bound=JsonRecord)
@@ -225,19 +249,6 @@ class StepLog:
         for name in _ORDER[_ORDER.index(step):]:
             self._steps.pop(name, None)
         self._write()
-
-    def files(self, step: str) -> list[str]:
-        """Returns the names of the files of a finished step; none if it is not finished."""
-        return list(self._steps.get(step, {}).get("files", ()))
-
-    def copy_to(self, out: Path, last: str, result: JsonRecord) -> None:
-        """Writes the steps up to `last`, with another result of it, to a folder with their files.
-        """
-        names = [name for name in _ORDER[:_ORDER.index(last) + 1] if name in self._steps]
-        other = StepLog(out)
-        other._steps = {name: self._steps[name] for name in names}
-        other._steps[last] = {**self._steps[last], "result": result.to_json()}
-        other._write()
 
     def _write(self) -> None:
         atomic.write_json(

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
-from recon_cli.sfm.job import MappingJob, Record, StepLog
+from recon_cli.sfm.job import MappingJob, StepLog
 from recon_cli.workspace.json_record import KEY, JsonRecord
-from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, WorldSummary
+from recon_cli.workspace.summaries import AttemptSummary, PartSummary, PosesSummary
 
 Names = tuple[str, ...]
 
@@ -53,32 +52,10 @@ class SplitResult(StepResult):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartResult(JsonRecord):
-    """A part of the capture; figures without tracks are None. See also `SfmSummary`."""
-
-    registered: Names  # frames with a camera, sorted
-    points: int
-    mean_track_length: float | None
-    reprojection_error_px: float | None
-    median_triangulation_angle_deg: float | None
-    rejected: Mapping[str, str]
-    verdict: Mapping[str, Any] | None
-    lines: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EarlierRun(JsonRecord):
-    """The run that found the parts, where another one takes a part of them."""
-
-    segments: int
-    cpu_seconds: Mapping[str, float]
-
-
-@dataclass(frozen=True, kw_only=True)
 class ModelResult(StepResult):
     """The parts of the capture, and how they were found; see `SfmSummary`."""
 
-    parts: tuple[PartResult, ...]  # that which shows most first
+    parts: tuple[PartSummary, ...]  # that which shows most first
     models: tuple[int, ...]
     poses: PosesSummary | None = field(default_factory=lambda: None)
     apart: tuple[Names, ...] = ()
@@ -86,27 +63,12 @@ class ModelResult(StepResult):
     broken: tuple[str, ...] = ()
     left_out: Names = ()
     notes: tuple[str, ...] = ()
-    earlier: EarlierRun | None = field(default=None, metadata={KEY: "finished"})
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlacedResult(StepResult):
-    """The world frame of the part that is placed."""
-
-    world: WorldSummary
-
-
-@dataclass(frozen=True, kw_only=True)
-class UndistortedResult(StepResult):
-    """Its undistorted cameras: width, height, focal_px and frames."""
-
-    cameras: tuple[Mapping[str, float], ...]
 
 
 # By step; see `job.STEPS`.
 RESULTS: Mapping[str, type[StepResult]] = {
     "features": FeaturesResult, "matches": MatchesResult, "split": SplitResult,
-    "model": ModelResult, "sparse": PlacedResult, "undistorted": UndistortedResult}
+    "model": ModelResult}
 
 
 @dataclass(frozen=True)
@@ -114,8 +76,6 @@ class MappingResult:
     """What a finished job found."""
 
     model: ModelResult
-    world: WorldSummary
-    cameras: tuple[Mapping[str, float], ...]  # undistorted
     seconds: Mapping[str, float]  # by step
     cpu_seconds: Mapping[str, float]
 
@@ -123,16 +83,9 @@ class MappingResult:
     def read(cls, job: MappingJob) -> MappingResult:
         """Returns what the log of a job says, all of whose steps are finished."""
         log = StepLog(job.out)
-
-        def result(step: str, kind: type[Record]) -> Record:
-            found = log.result(step, kind)
-            assert found is not None, f"the mapping process ended without {step}"
-            return found
-
-        placed = result("sparse", PlacedResult)
-        every = {step: result(step, StepResult) for step in job.steps}
+        model = log.result("model", ModelResult)
+        every = {step: log.result(step, StepResult) for step in job.steps}
+        assert model is not None, "the mapping process ended without a model"
         return cls(
-            result("model", ModelResult), replace(placed.world, seconds=placed.seconds),
-            result("undistorted", UndistortedResult).cameras,
-            {step: each.seconds for step, each in every.items()},
-            {step: each.cpu_seconds for step, each in every.items()})
+            model, {step: each.seconds for step, each in every.items() if each},
+            {step: each.cpu_seconds for step, each in every.items() if each})

@@ -34,6 +34,7 @@ from recon_cli.workspace.summaries import (
     ImportSummary,
     IngestSummary,
     JsonRecord,
+    PlaceSummary,
     PruneSummary,
     SfmSummary,
     TrainSummary,
@@ -64,9 +65,6 @@ class Stage:
     optional_when_imported: tuple[str, ...] = ()  # `needs` that an imported scene only `uses`
     # another version of recon may have made its needs: it only shows, scores or writes the scene
     reads_other_versions: bool = False
-    # options that decide its last steps alone: where they are all that differs, it is given its
-    # last result to continue
-    late: tuple[str, ...] = ()
     # folder of outputs that a user may change, remove or add: the next run is given its last result
     # to read them from
     edits: str = ""
@@ -87,6 +85,7 @@ class Stage:
 
 
 _EXPORT_VERSION = 7
+_PLACE_OPTIONS = ("part", "gravity", "scale_between")
 _SCENE_OPTIONS = tuple(item.name for item in fields(ExportConfig)
                        if item.name not in FORMAT_OPTIONS)
 
@@ -95,9 +94,9 @@ def _format_stage(row: ExportFormat) -> Stage:
     """Returns the row of an exported format, which fits the .ply or, of cameras, its frame."""
     cameras = row.kind == "cameras"
     return Stage(
-        f"export.{row.name}", "export", ("ingest", "sfm", "train", "export"),
+        f"export.{row.name}", "export", ("ingest", "place", "train", "export"),
         () if cameras else ("prune",), ExportConfig, ExportedFile, _EXPORT_VERSION, False,
-        "recon_cli.stages.export", renders=True, optional_when_imported=("ingest", "sfm"),
+        "recon_cli.stages.export", renders=True, optional_when_imported=("ingest", "place"),
         reads_other_versions=True, options=row.key_options,
         reads={"train": (), "export": (TRANSFORM,)} if cameras else {})
 
@@ -107,25 +106,29 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.ingest", input_metavar="VIDEO"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 4, True,
           "recon_cli.stages.denoise"),
-    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 4, True,
+    Stage("sfm", "sfm", ("ingest",), (), SfmConfig, SfmSummary, 4, True,
           "recon_cli.stages.sfm",
           ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json"),
-          own_digests=True, late=("part", "gravity", "scale_between")),
-    Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 5, False,
+          own_digests=True, options=tuple(
+              item.name for item in fields(SfmConfig) if item.name not in _PLACE_OPTIONS)),
+    Stage("place", "sfm", ("ingest", "denoise", "sfm"), (), SfmConfig, PlaceSummary, 1, True,
+          "recon_cli.stages.place", ("log.txt", "verdict.json"), own_digests=True,
+          options=_PLACE_OPTIONS),
+    Stage("train", "train", ("ingest", "place"), (), TrainConfig, TrainSummary, 5, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"),
           states=("mid.safetensors", "final.safetensors"), renders=True, edits="masks"),
-    Stage("prune", "prune", ("ingest", "sfm", "train"), (), PruneConfig, PruneSummary, 4, False,
+    Stage("prune", "prune", ("ingest", "place", "train"), (), PruneConfig, PruneSummary, 4, False,
           "recon_cli.stages.prune", ("log.jsonl",), from_states=("train",), renders=True),
-    Stage("evaluate", "eval", ("ingest", "sfm", "train"), ("prune",), EvaluateConfig,
+    Stage("evaluate", "eval", ("ingest", "place", "train"), ("prune",), EvaluateConfig,
           EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True,
           reads_other_versions=True),
-    Stage("export", "export", ("ingest", "sfm", "train"), ("prune",), ExportConfig,
+    Stage("export", "export", ("ingest", "place", "train"), ("prune",), ExportConfig,
           ExportSummary, _EXPORT_VERSION, False, "recon_cli.stages.export", renders=True,
-          optional_when_imported=("ingest", "sfm"), reads_other_versions=True,
+          optional_when_imported=("ingest", "place"), reads_other_versions=True,
           options=_SCENE_OPTIONS,
           parts=tuple(map(_format_stage, list(EXPORT_FORMATS.values())[1:]))))
 
-IMPORT = Stage("train", "import", (), ("ingest", "sfm"), ImportConfig, ImportSummary, 1, False,
+IMPORT = Stage("train", "import", (), ("ingest", "place"), ImportConfig, ImportSummary, 1, False,
                "recon_cli.stages.import_scene", renders=True, input_metavar="FILE")
 
 

@@ -225,7 +225,7 @@ def run(
     trust = assess(TrustTask(
         name, rendered, evaluation.config, evaluation.scene, evaluation.held_out,
         config.max_size or evaluation.config.max_size, evaluation.import_record,
-        WorldSummary.read(inputs.folders["sfm"])), out, ctx) if config.trust else None
+        WorldSummary.read(inputs.folders["place"])), out, ctx) if config.trust else None
     return EvaluateSummary(**means, poorly_seen=tuple(trust.lines()) if trust else None)
 
 

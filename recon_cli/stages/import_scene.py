@@ -72,11 +72,11 @@ def _align(
 
     `moved` leads from the splats to the frame of the file.
     """
-    if not {"ingest", "sfm"} <= inputs.folders.keys():
+    if not {"ingest", "place"} <= inputs.folders.keys():
         return None
     scene = load_scene(inputs.folders, validation=config.validation)
     return align_to_views(
-        splats, scene, read_world(inputs.folders["sfm"]), config.frame, config.max_size, ctx,
+        splats, scene, read_world(inputs.folders["place"]), config.frame, config.max_size, ctx,
         moved=moved)
 
 

@@ -80,7 +80,7 @@ class EditedMasks:
             raise InputError(
                 f"The mask {path} has {width}x{height} pixels, but {camera.width}x{camera.height} "
                 "or the same shape in another size is needed.",
-                hint="Draw it over the picture of that name in sfm/undistorted/images.")
+                hint="Draw it over the picture of that name in place/undistorted/images.")
         grey = cv2.resize(image.max(axis=2), (camera.width, camera.height),
                           interpolation=cv2.INTER_NEAREST_EXACT)
         return np.asarray(grey >= _HALF)

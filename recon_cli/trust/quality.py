@@ -18,7 +18,7 @@ from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.trust.scene_trust import ModelTrust, TrustRecord
 from recon_cli.workspace.records import Frame
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import PlaceSummary
 
 GOOD, FAIR, POOR, UNKNOWN = "good", "fair", "poor", "unknown"
 GOOD_PSNR_DB, GOOD_SSIM = 28.0, 0.90
@@ -40,7 +40,7 @@ class Quality:
 
 
 def read_quality(
-    evaluate: Path, sfm: SfmSummary | None, frames: Sequence[Frame] = ()
+    evaluate: Path, sfm: PlaceSummary | None, frames: Sequence[Frame] = ()
 ) -> Quality:
     """Returns the quality by the files in evaluate's folder; unknown where they cannot be read."""
     try:
@@ -50,7 +50,7 @@ def read_quality(
 
 
 def describe_quality(
-    metrics: Metrics | None, trust: TrustRecord | None, sfm: SfmSummary | None,
+    metrics: Metrics | None, trust: TrustRecord | None, sfm: PlaceSummary | None,
     frames: Sequence[Frame] = (),
 ) -> Quality:
     """Returns the quality of the model that export takes.
@@ -122,7 +122,7 @@ def name_view(name: str, frames: Sequence[Frame]) -> str:
     return f"{name} (at {int(seconds) // 60}:{int(seconds) % 60:02d} of the video)"
 
 
-def _doubt_cameras(sfm: SfmSummary | None) -> list[str]:
+def _doubt_cameras(sfm: PlaceSummary | None) -> list[str]:
     """Returns what speaks against the cameras."""
     if sfm is None:
         return []

@@ -130,7 +130,7 @@ class LiveView(TrainCallback):
 
     def _up(self, cameras: Sequence[Camera]) -> NDArray[np.float64]:
         try:
-            world = WorldSummary.read(self._workspace.folder("sfm"))
+            world = WorldSummary.read(self._workspace.folder("place"))
             if world and world.evidence.up_found:
                 return np.array([0.0, 0.0, 1.0])
         except (ReconError, OSError):

@@ -64,7 +64,17 @@ class Workspace:
 
     def folder(self, stage: str) -> Path:
         """Returns where a stage's finished result lies or will lie."""
+        return self._target("sfm" if stage == "place" and self._sfm_placed else stage)
+
+    def _target(self, stage: str) -> Path:
+        """Returns where a stage's next result will lie."""
         return self.root / stage.partition(".")[0]
+
+    @property
+    def _sfm_placed(self) -> bool:
+        """Whether sfm has made the views, as before `place` was a stage of its own."""
+        return not os.path.lexists(self._target("place")) and (
+            self._target("sfm") / "undistorted").is_dir()
 
     def partial(self, stage: str) -> Path:
         """Returns where a stage writes before it is finished."""
@@ -117,7 +127,10 @@ class Workspace:
             ManifestError: there is one that cannot be trusted.
         """
         folder, name = self.folder(stage), manifest_name(stage)
-        return Manifest.read(folder, name) if _has_manifest(folder, name) else None
+        if not _has_manifest(folder, name):
+            return None
+        manifest = Manifest.read(folder, name)
+        return manifest if manifest.key.stage != "sfm" or stage == "sfm" else manifest.as_place()
 
     def partial_run(self, stage: str) -> PartialRun | None:
         """Returns how far an interrupted run of a stage came, or None."""
@@ -201,14 +214,14 @@ class Workspace:
         """Renames the old result away and the new one into place; any prefix can be resumed."""
         partial = self.partial(stage)
         if shared_folder.is_shared(stage):
-            shared_folder.move_in(partial, self.folder(stage))
-            sync_folder(self.folder(stage))
+            shared_folder.move_in(partial, self._target(stage))
+            sync_folder(self._target(stage))
             self._old(stage).parent.mkdir(exist_ok=True)
             remove(self._old(stage))
             move(partial, self._old(stage))
         else:
             self._retire(stage)
-            move(partial, self.folder(stage))
+            move(partial, self._target(stage))
         sync_folder(self.root)
         sync_folder(partial.parent)
         remove(self._record(stage))
@@ -218,7 +231,7 @@ class Workspace:
     def _retire(self, stage: str) -> None:
         """Renames a stage's result to .old/, where it may be removed at any time."""
         self._refuse_foreign(stage)
-        folder, old = self.folder(stage), self._old(stage)
+        folder, old = self._target(stage), self._old(stage)
         if not os.path.lexists(folder):
             return
         old.parent.mkdir(exist_ok=True)
@@ -242,7 +255,7 @@ class Workspace:
         for partial in _folders(self.root / journal.PARTIAL):
             if not self._record(partial.name).is_file() or not _complete(partial):
                 continue
-            damage = (shared_folder.find_damage(partial, self.folder(partial.name))
+            damage = (shared_folder.find_damage(partial, self._target(partial.name))
                       if shared_folder.is_shared(partial.name) else
                       find_changed_outputs(partial, Manifest.read(partial), ()))
             if damage:
@@ -253,9 +266,9 @@ class Workspace:
                 logger.info("%s: finishing work that a crash interrupted", partial.name)
                 self._swap(partial.name)
         for old in _folders(self.root / _OLD):
-            if not self.folder(old.name).exists() and _complete(old):
+            if not self._target(old.name).exists() and _complete(old):
                 logger.info("%s: restoring the result from before a crash", old.name)
-                move(old, self.folder(old.name))
+                move(old, self._target(old.name))
                 sync_folder(self.root)
             else:
                 remove(old)
@@ -271,7 +284,7 @@ class Workspace:
 
     def result_paths(self, stage: str) -> list[Path]:
         """Returns what is removed with a stage's result: its folder, or its files in one."""
-        folder = self.folder(stage)
+        folder = self._target(stage)
         return shared_folder.result_paths(folder, stage) if "." in stage else [folder]
 
     def scraps(self) -> list[Path]:
@@ -291,7 +304,7 @@ class Workspace:
 
     def _refuse_foreign(self, stage: str) -> None:
         """Refuses to replace a folder that is not ours: -w may point anywhere."""
-        folder = self.folder(stage)
+        folder = self._target(stage)
         if folder.exists() and not _has_manifest(folder):
             raise WorkspaceError(
                 f"{folder} is in the way: recon did not make it, for it holds no {manifest.NAME}.",

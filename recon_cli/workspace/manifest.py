@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.workspace.atomic import read_json, write_json
@@ -50,6 +50,16 @@ class ResultKey(JsonRecord):
     # anew
     continues: str | None = None
     verb: str = ""  # that made it; empty in records of before verbs were kept
+
+    @classmethod
+    def from_json(cls, value: Any) -> Self:
+        """Returns the key that `to_json` wrote; what once read views of sfm reads those of place.
+        """
+        key = super().from_json(value)
+        if key.stage in ("sfm", "place") or "sfm" not in key.upstream:
+            return key
+        return dataclasses.replace(key, upstream={
+            "place" if name == "sfm" else name: digest for name, digest in key.upstream.items()})
 
     @property
     def fingerprint(self) -> str:
@@ -95,6 +105,14 @@ class Manifest:
         """Returns the digest of the outputs alone whose paths match a pattern."""
         return digest_outputs({name: file for name, file in self.outputs.items()
                                if matches(name, patterns)}, ())
+
+    def as_place(self) -> Manifest:
+        """Returns the part of a result of sfm that `place` makes now."""
+        key = dataclasses.replace(self.key, stage="place", version=1, upstream={
+            **self.key.upstream, "sfm": self.digest})
+        return dataclasses.replace(self, key=key, outputs={
+            name: file for name, file in self.outputs.items()
+            if matches(name, ("sparse/*", "undistorted/*", "world.json"))})
 
     def write(self, folder: Path) -> None:
         """Writes the manifest into a stage's folder, whole or not at all."""
@@ -225,7 +243,7 @@ def differences(
             reasons.append(
                 f"{section}.{name} changed: {_value_text(before)} -> {_value_text(after)}")
     reasons += _source_changes(old.sources, new.sources)
-    for name in {**new.upstream, **old.upstream}:
+    for name in new.upstream:
         had, has = old.upstream.get(name), new.upstream.get(name)
         if had and has and had != has:
             reasons.append(f"{name}'s output changed")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from recon_cli.errors import FormatError, ManifestError
+from recon_cli.errors import FormatError, ManifestError, list_names
 from recon_cli.scene.camera import Lens, make_lens, panorama_lens
 from recon_cli.workspace import atomic
 from recon_cli.workspace.json_record import JsonRecord
@@ -122,6 +122,15 @@ def name_photos(ingest: Path, *, shown: Callable[[str], str] = str) -> Callable[
     except FormatError:
         return str
     return lambda text: _FRAME_NAME.sub(lambda found: photos.get(found[0], found[0]), text)
+
+
+def refuse_missing_frames(folder: Path, names: Collection[str], verb: str) -> None:
+    """Raises FormatError where a folder of frames, which `verb` wrote, lacks some of them."""
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        raise FormatError(
+            f"{folder} lacks {len(missing)} of {len(names)} frames: {list_names(missing)}.",
+            hint=f"Run `recon {verb} --again`.")
 
 
 def find_frames(ingest: Path, words: Sequence[str]) -> tuple[str, ...]:
@@ -292,4 +301,4 @@ class ImportRecord(JsonRecord):
 def has_views(folders: Mapping[str, Path]) -> bool:
     """Returns whether views were trained on or compared with; `folders` are by stage name."""
     record = ImportRecord.read(folders["train"])
-    return (record is None or record.views) and "sfm" in folders
+    return (record is None or record.views) and "place" in folders

@@ -103,7 +103,7 @@ class WorldEvidence(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldSummary(JsonRecord):
-    """The world frame of a workspace, in sfm/world.json and in the summary of sfm."""
+    """The world frame of a workspace, in place/world.json and in the summary of place."""
 
     FILE: typing.ClassVar[str] = "world.json"
 
@@ -111,17 +111,16 @@ class WorldSummary(JsonRecord):
     evidence: WorldEvidence
     measurement: Mapping[str, Any] | None  # that gave the scale
     sentences: tuple[str, ...]  # the same for a terminal
-    seconds: float | None = None
 
     @classmethod
-    def read(cls, sfm: Path) -> WorldSummary | None:
-        """Returns the world frame in the finished folder of sfm; None where there is none.
+    def read(cls, place: Path) -> WorldSummary | None:
+        """Returns the world frame in the finished folder of place; None where there is none.
 
         Raises:
             ManifestError: the file is of another version.
             FormatError: it is damaged.
         """
-        path = sfm / cls.FILE
+        path = place / cls.FILE
         hint = "Run `recon sfm --again`."
         return cls.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
 
@@ -130,36 +129,25 @@ class WorldSummary(JsonRecord):
 class PartSummary(JsonRecord):
     """A part of a capture that can be trusted by itself, in sfm/parts."""
 
-    names: tuple[str, ...]  # of its frames
+    names: tuple[str, ...]  # of its frames, sorted
     points: int
+    rejected: Mapping[str, str] = field(default_factory=dict)  # why frames were taken out of it
 
 
 @dataclass(frozen=True, kw_only=True)
 class SfmSummary(JsonRecord):
-    """The cameras that sfm found, and how far they can be trusted; of one part of the capture."""
+    """The models that sfm found."""
 
     frames: int  # of ingest
-    registered: int  # frames with a camera
-    points: int
-    mean_track_length: float | None  # images that see a point; None, as the next two, if given
-    reprojection_error_px: float | None  # mean
-    median_triangulation_angle_deg: float | None  # widest angle between two rays to a point
     poses: PosesSummary | None  # None without known poses
     models: tuple[int, ...]  # frames in the model and in what is left of the others
     apart: tuple[tuple[str, ...], ...]  # names of the frames that only other models hold
-    rejected: Mapping[str, str]  # why frames were taken out of the model, by name
-    verdict: Mapping[str, Any] | None  # `sfm.verdict.Verdict`; None for poses not examined
-    lines: tuple[str, ...]  # the verdict in words
     attempts: tuple[AttemptSummary, ...] = field(metadata={KEY: "rungs"})
     seconds: Mapping[str, float]  # by step
-    unregistered: tuple[str, ...]  # names of the frames without a camera
-    unregistered_held_out: tuple[str, ...]  # those of them that are held out
-    world: WorldSummary
-    cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
     left_out: tuple[str, ...] = ()  # names of the frames whose camera is in no part
     parts: tuple[PartSummary, ...] = ()  # that which shows most first; none in older results
-    part: int | None = None  # the number of the one that is placed; None where there is only one
     broken: tuple[str, ...] = ()  # why the model was cut, sentences; none where it was not
+    notes: tuple[str, ...] = ()  # sentences on how it was found
     segments: int = 1  # that were mapped apart and joined; 1 for a capture mapped as a whole
     cpu_seconds: Mapping[str, float] | None = None  # by step; those of segments together
 
@@ -176,6 +164,31 @@ class SfmSummary(JsonRecord):
             reasons.append("it was mapped without segments" if self.segments == 1 else
                            f"it was mapped in {self.segments} segments")
         return tuple(reasons)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedPart(JsonRecord):
+    """The cameras of one part of the capture in the world, and how far they can be trusted."""
+
+    points: int
+    mean_track_length: float | None  # images that see a point; None, as the next two, if given
+    reprojection_error_px: float | None  # mean
+    median_triangulation_angle_deg: float | None  # widest angle between two rays to a point
+    verdict: Mapping[str, Any] | None  # `sfm.verdict.Verdict`; None for poses not examined
+    lines: tuple[str, ...]  # the verdict in words
+    world: WorldSummary
+    cameras: tuple[Mapping[str, float], ...]  # width, height, focal_px (undistorted), frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaceSummary(PlacedPart, SfmSummary):
+    """The part of the capture that is used, and what sfm found."""
+
+    registered: int  # frames with a camera
+    rejected: Mapping[str, str]  # why frames were taken out of the model, by name
+    unregistered: tuple[str, ...]  # names of the frames without a camera
+    unregistered_held_out: tuple[str, ...]  # those of them that are held out
+    part: int | None = None  # the number of this part; None where there is only one
 
     @property
     def trusted(self) -> bool | None:

@@ -48,7 +48,7 @@ def config_of(opened: Workspace, stage: str) -> dict[str, object]:
 def test_each_method_runs_its_stage_and_what_that_needs(fakes: Workspace, tmp_path: Path) -> None:
     assert fakes.ingest(str(tmp_path / "room.mp4")).ran
     trained = fakes.train(iterations=7)  # denoise and sfm run first
-    assert fake_stages.ran == ["ingest", "denoise", "sfm", "train"]
+    assert fake_stages.ran == ["ingest", "denoise", "sfm", "place", "train"]
     assert (trained.ran, trained.stage, trained.folder) == (True, "train", fakes.path / "train")
     assert config_of(fakes, "train")["iterations"] == 7
     assert not fakes.train(iterations=7).ran
@@ -153,12 +153,12 @@ def test_a_capture_from_python_is_that_of_the_commands(
     assert capfd.readouterr() == ("", "")
     # the same by commands: the same results, and each takes those of the other for fresh
     write_options(tmp_path / "other")
-    for stage in ("ingest", "denoise", "sfm"):
+    for stage in ("ingest", "denoise", "sfm", "place"):
         shutil.copytree(opened.path / stage, tmp_path / "other" / stage)
     at = ["-w", str(tmp_path / "other")]
     for command in (["ingest", str(sample_video)], ["train"], ["prune", "--ratio", "0.5"]):
         assert cli.main([*command, *at]) == 0
-    for stage in ("ingest", "denoise", "sfm"):
+    for stage in ("ingest", "denoise", "sfm", "place"):
         name = f"{stage}/manifest.json"
         assert (tmp_path / "other" / name).read_bytes() == (opened.path / name).read_bytes()
     for stage in ("train", "prune"):

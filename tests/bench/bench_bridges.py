@@ -280,11 +280,11 @@ def write_job(views: Mapping[str, View], folder: Path) -> MappingJob:
         cv2.imwrite(str(folder / "frames" / name), cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
         sizes.setdefault((view.image.shape[1], view.image.shape[0]), []).append(name)
     return MappingJob(
-        frames=folder / "frames", denoised=folder / "frames", out=folder, groups=tuple(
+        frames=folder / "frames", out=folder, groups=tuple(
             CameraGroup(tuple(sorted(names)), *size) for size, names in sorted(sizes.items())),
         masks=None, poses=None, pose_use="ignore", given_points=False, pairs="auto",
-        max_features=3000, min_registered=0.1, accept_weak=False, partial=True, gravity=False,
-        scale_between=None, max_minutes=60, seed=0, threads=1, sharpness={}, times={},
+        max_features=3000, min_registered=0.1, accept_weak=False, partial=True,
+        max_minutes=60, seed=0, threads=1, sharpness={}, times={},
         last="sparse")
 
 

@@ -121,5 +121,5 @@ def mapping_job(ingest: Path, out: Path, **changes: Any) -> MappingJob:
         "max_features": 3000, "min_registered": 0.5, "accept_weak": False, "partial": False,
         "gravity": False, "scale_between": None, "max_minutes": 60.0, "seed": 0, "threads": 1,
         "sharpness": {}, "times": {}, **changes}
-    return MappingJob(frames=ingest / records.FOLDER, denoised=ingest / records.FOLDER, out=out,
+    return MappingJob(frames=ingest / records.FOLDER, out=out,
                       groups=groups, **fields)

@@ -118,7 +118,7 @@ def test_the_bundled_video_is_there(sample_video: Path) -> None:
 def test_train_prune_branches_off_in_the_middle() -> None:
     assert main(["ingest", "room.mp4"]) == 0
     assert main(["train", "--prune", "--ratio", "0.25", "--iterations", "10"]) == 0
-    assert fake_stages.ran == ["ingest", "denoise", "sfm", "train", "prune"]
+    assert fake_stages.ran == ["ingest", "denoise", "sfm", "place", "train", "prune"]
     assert config_of("train")["iterations"] == 10
     prune = config_of("prune")
     assert (prune["at"], prune["ratio"]) == ("mid", 0.25)

@@ -45,10 +45,10 @@ IMPORT = {
     ("ingest", INGEST, ("75 of 1,200 frames", "video", "600x340", "10 held out", "6 too blurred")),
     ("denoise", {"mode": "auto", "frames": 12, "denoised": 3, "median_sigma_255": 0.3263}, (
         "noise 0.3 of 255", "3 of 12 frames filtered")),
-    ("sfm", SFM, ("70 of 75 frames placed", "the model is trusted")),
-    ("sfm", SFM | {"verdict": {"trusted": False}, "left_out": ["a.png"]},
+    ("place", SFM, ("70 of 75 frames placed", "the model is trusted")),
+    ("place", SFM | {"verdict": {"trusted": False}, "left_out": ["a.png"]},
      ("NOT trusted", "1 left out")),
-    ("sfm", SFM | {"part": 1, "parts": [{"names": [], "points": 1}] * 2}, ("part 1 of 2",)),
+    ("place", SFM | {"part": 1, "parts": [{"names": [], "points": 1}] * 2}, ("part 1 of 2",)),
     ("train", TRAIN, ("53,210 Gaussians", "3,000 iterations", "32.99 dB on validation views")),
     ("train", TRAIN | {"blocks": 4, "stopped_early_at": 2000, "skipped_steps": 1},
      ("in 4 blocks", "stopped early", "1 step skipped")),

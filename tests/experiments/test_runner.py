@@ -92,7 +92,7 @@ def test_a_digest_is_of_what_a_scene_holds(tmp_path: Path) -> None:
     one = SceneFolders("one", make_inputs(tmp_path / "a"))
     two = SceneFolders("two", make_inputs(tmp_path / "b"))
     assert one.digest == two.digest
-    image = tmp_path / "b" / "sfm" / "undistorted" / "denoised" / "000003.png"
+    image = tmp_path / "b" / "place" / "undistorted" / "denoised" / "000003.png"
     image.write_bytes(image.read_bytes() + b"\0")
     assert SceneFolders("two", two.inputs).digest != one.digest
 

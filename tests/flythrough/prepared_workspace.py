@@ -29,9 +29,9 @@ def run(config, inputs, out, ctx):  # noqa: ARG001 - the signature of a stage
     source = prepared["folder"] / out.name
     if source.is_dir():
         shutil.copytree(source, out, dirs_exist_ok=True)
-    if out.name == "sfm":
+    if out.name == "place":
         world = replace(summaries.WORLD, evidence=replace(summaries.EVIDENCE, **evidence))
-        return replace(summaries.SFM, world=world)
+        return replace(summaries.PLACE, world=world)
     return summaries.BY_STAGE[out.name]
 
 
@@ -49,7 +49,8 @@ def make_workspace(
     (folder / "room.mp4").write_text("a video")
     prepared["folder"] = folder / "made"
     evidence.update(up_found=up_found, metres=metres)
-    names = ["ingest", "denoise", "sfm", "train", *(["prune"] if pruned is not None else [])]
+    names = ["ingest", "denoise", "sfm", "place", "train",
+             *(["prune"] if pruned is not None else [])]
     job = Job(Workspace(folder / "ws"), compute=ComputeConfig(), table=TABLE)
     plan.run(job, "run", [
         Target(row.name, row.config(), (folder / "room.mp4",) if row.name == "ingest" else ())

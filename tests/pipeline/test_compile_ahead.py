@@ -92,11 +92,11 @@ def test_a_failure_goes_to_the_log_and_not_to_the_terminal(tmp_path, worker, cap
 
 
 @pytest.mark.parametrize(("stages", "finished", "again", "compute", "beside"), [
-    (["ingest", "denoise", "sfm", "train"], [], False, {}, True),
+    (["ingest", "denoise", "sfm", "place", "train"], [], False, {}, True),
     (["train"], ["ingest", "denoise"], False, {}, True),  # sfm runs first
-    (["train"], ["ingest", "denoise", "sfm"], False, {}, False),
-    (["train"], ["ingest", "denoise", "sfm"], True, {}, False),
-    (["sfm", "train"], ["ingest", "denoise", "sfm"], True, {}, True),
+    (["train"], ["ingest", "denoise", "sfm", "place"], False, {}, False),
+    (["train"], ["ingest", "denoise", "sfm", "place"], True, {}, False),
+    (["sfm", "place", "train"], ["ingest", "denoise", "sfm", "place"], True, {}, True),
     (["ingest", "denoise", "sfm"], [], False, {}, False),
     (["ingest", "train"], [], False, {"backend": "numba", "device": "cpu"}, True),
     (["ingest", "train"], [], False, {"backend": "torch"}, False),

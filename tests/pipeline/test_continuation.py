@@ -81,7 +81,7 @@ def test_why_a_longer_run_begins_anew_is_told(job: Job, caplog: pytest.LogCaptur
 
 
 def test_a_run_on_other_cameras_or_a_changed_result_begins_anew(job: Job) -> None:
-    bring(job, "sfm", changes={"sfm": {"max_features": 500}})
+    bring(job, "sfm", "place", changes={"sfm": {"max_features": 500}})
     bring(job, "train", changes=longer(6000))
     assert seen["train"].continues is None
     (job.workspace.folder("train") / "result.txt").write_text("other bytes, of another size")

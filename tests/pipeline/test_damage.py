@@ -87,7 +87,8 @@ def test_one_damaged_manifest_stops_neither_status_nor_clean_for_the_others(
 ) -> None:
     (job.workspace.folder("train") / "manifest.json").write_text('{"seconds": NaN}')
     states = {stage.name: stage.state for stage in plan.status(job)}
-    assert states == {"ingest": "fresh", "denoise": "fresh", "sfm": "fresh", "train": "damaged",
+    assert states == {"ingest": "fresh", "denoise": "fresh", "sfm": "fresh", "place": "fresh",
+                      "train": "damaged",
                       "prune": "stale", "evaluate": "stale", "export": "stale"}
     (job.workspace.root / ".old").mkdir(exist_ok=True)
     (job.workspace.root / ".partial").mkdir(exist_ok=True)

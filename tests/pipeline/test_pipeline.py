@@ -1,6 +1,7 @@
 """Which stages run and which do not, and that a killed run can be resumed."""
 
 
+import dataclasses
 import errno
 import os
 import shutil
@@ -13,7 +14,7 @@ from pathlib import Path
 import fake_stages
 import pytest
 from facts import assert_facts
-from fake_stages import STEPS, bring, job_at, seen, stale
+from fake_stages import NAMES, STEPS, bring, job_at, stale
 
 from recon_cli.commands.workspace import status_table
 from recon_cli.config.settings import Settings
@@ -28,6 +29,7 @@ from recon_cli.errors import (
 )
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job
+from recon_cli.workspace.digests import digest_file
 from recon_cli.workspace.manifest import NAME
 
 
@@ -39,13 +41,13 @@ def test_train_runs_denoise_and_sfm_first(tmp_path: Path) -> None:
     (tmp_path / "room.mp4").write_text("x")
     job = job_at(tmp_path / "ws")
     bring(job, "ingest", video=tmp_path / "room.mp4")
-    assert bring(job, "train") == ["denoise", "sfm", "train"]
+    assert bring(job, "train") == ["denoise", "sfm", "place", "train"]
 
 
 @pytest.mark.parametrize(("verb", "gone", "message", "hint"), [
     ("train", ["ingest"], "train needs ingest, which is missing", "`recon ingest VIDEO`"),
     ("evaluate", ["train"], "eval needs train, which is missing", "`recon train`"),
-    ("prune", ["train", "sfm"], "prune needs train, which is missing", "`recon train`"),
+    ("prune", ["train", "place"], "prune needs train, which is missing", "`recon train`"),
     ("export", ["train"], "export needs train, which is missing", "`recon train`"),
 ])
 def test_training_is_never_implicit_and_the_command_to_type_is_named(
@@ -62,11 +64,13 @@ def test_training_is_never_implicit_and_the_command_to_type_is_named(
 
 def test_the_command_to_type_is_one_that_the_shell_and_the_verb_take(job: Job) -> None:
     changes = {"sfm": {"scale_between": ("my frame.png", "b.png", 1.5)}, "denoise": {"mode": "off"}}
-    bring(job, "denoise", "sfm", changes=changes)
+    changes["sfm"]["max_features"] = 500
+    bring(job, "denoise", "sfm", "place", changes=changes)
     look = job.inspect()
     assert plan.command(look, look.check("denoise")) == "recon denoise --off"
-    assert plan.command(look, look.check("sfm")) == (
-        "recon sfm --scale-between 'my frame.png' b.png 1.5")
+    for name in ("sfm", "place"):  # which are one verb, with the options of both
+        assert plan.command(look, look.check(name)) == (
+            "recon sfm --max-features 500 --scale-between 'my frame.png' b.png 1.5")
 
 
 def test_a_stage_keeps_the_options_it_was_made_with_when_others_need_it(job: Job) -> None:
@@ -95,7 +99,7 @@ def test_a_stage_that_runs_implicitly_keeps_its_options(job: Job, folder: Path) 
     bring(job, "sfm", changes={"sfm": {"pairs": "exhaustive"}})
     (folder / "room.mp4").write_text("another video")
     bring(job, "ingest")
-    assert bring(job, "train") == ["denoise", "sfm", "train"]
+    assert bring(job, "train") == ["denoise", "sfm", "place", "train"]
     manifest = job.workspace.manifest("sfm")
     assert manifest
     assert manifest.key.config["pairs"] == "exhaustive"
@@ -104,13 +108,13 @@ def test_a_stage_that_runs_implicitly_keeps_its_options(job: Job, folder: Path) 
 def test_a_missing_stage_makes_those_behind_it_stale_only_if_it_comes_out_otherwise(
     job: Job,
 ) -> None:
-    shutil.rmtree(job.workspace.folder("sfm"))
-    assert list(stale(job)) == ["sfm"]
+    shutil.rmtree(job.workspace.folder("place"))
+    assert list(stale(job)) == ["place"]
     assert bring(job, "export") == []
-    assert bring(job, "evaluate", changes={"evaluate": {"max_size": 50}}) == ["sfm", "evaluate"]
-    shutil.rmtree(job.workspace.folder("sfm"))
+    assert bring(job, "evaluate", changes={"evaluate": {"max_size": 50}}) == ["place", "evaluate"]
+    shutil.rmtree(job.workspace.folder("place"))
     other: Settings = {"sfm": {"max_features": 999}}
-    with pytest.raises(StageError, match="eval needs train, which is stale: sfm's output changed"):
+    with pytest.raises(StageError, match="eval needs train, which is stale: place's output cha"):
         bring(job_at(job.workspace.root, other), "evaluate", again=True)
 
 
@@ -119,7 +123,7 @@ def test_a_stale_optional_stage_is_left_out_with_a_notice(
 ) -> None:
     other: Settings = {"prune": {"ratio": 0.25}}
     assert bring(job_at(job.workspace.root, other), "evaluate") == ["evaluate"]
-    assert set(fake_stages.seen["evaluate"].folders) == {"ingest", "sfm", "train"}
+    assert set(fake_stages.seen["evaluate"].folders) == {"ingest", "place", "train"}
     assert_facts(caplog.text, "prune", "eval", "stale", "prune.ratio", "automatic -> 0.25")
 
 
@@ -138,7 +142,7 @@ def test_a_manifest_says_how_the_result_came_about(job: Job) -> None:
     assert manifest.run.peak_memory_bytes > 1e6
     assert (manifest.run.device, manifest.run.backend) != (None, None)
     assert "numpy" in manifest.run.versions
-    assert set(manifest.key.upstream) == {"ingest", "sfm"}
+    assert set(manifest.key.upstream) == {"ingest", "place"}
     other = job.workspace.manifest("sfm")
     assert other
     assert (other.run.device, other.run.backend) == (None, None)
@@ -200,7 +204,7 @@ def test_a_run_refused_at_its_start_leaves_nothing_to_resume(job: Job) -> None:
     shutil.rmtree(job.workspace.folder("train"))
     with pytest.raises(InputError):
         bring(job, "train")
-    assert plan.status(job)[3].state == "missing"
+    assert plan.status(job)[4].state == "missing"
     assert job.workspace.scraps() == []
 
 
@@ -221,14 +225,14 @@ def test_an_interrupted_run_is_partial_until_what_it_reads_changes(job: Job) -> 
         bring(job, "train", changes={"train": {"iterations": 100}})
     assert stale(job) == {}  # the old result is as good as before
     shutil.rmtree(job.workspace.folder("train"))
-    one = plan.status(job)[3]
+    one = plan.status(job)[4]
     assert (one.state, one.done, one.total) == ("partial", 0, 0)
     assert "partial (just begun)" in status_table([one])
     with pytest.raises(StageError, match=r"unfinished \(just begun\)") as caught:
         bring(job, "prune", again=True)
     assert caught.value.hint == "Run `recon train --iterations 100` first."
-    bring(job, "sfm", changes={"sfm": {"max_features": 500}})
-    assert plan.status(job)[3].state == "missing"
+    bring(job, "sfm", "place", changes={"sfm": {"max_features": 500}})
+    assert plan.status(job)[4].state == "missing"
 
 
 def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) -> None:
@@ -239,7 +243,7 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
         env={**os.environ, "SLOW_TRAIN": "1"})
     try:
         started = time.monotonic()
-        while plan.status(job)[3].done < 2:
+        while plan.status(job)[4].done < 2:
             assert time.monotonic() - started < 60
             time.sleep(0.05)
         with pytest.raises(WorkspaceError, match=f"process {process.pid}") as caught:
@@ -248,7 +252,7 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    one = plan.status(job)[3]
+    one = plan.status(job)[4]
     assert one.state == "partial"
     assert 2 <= one.done < one.total == STEPS
     unfinished = job.workspace.partial_run("train")
@@ -265,22 +269,37 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
     assert stale(job) == {}
 
 
-def test_a_stage_is_given_its_last_result_where_only_late_options_differ(job):
-    assert bring(job, "sfm", changes={"sfm": {"part": 2}}) == ["sfm"]
-    earlier = seen["sfm"].earlier
-    assert earlier.folder == job.workspace.folder("sfm")
-    assert earlier.summary["steps"] == STEPS
-    bring(job, "sfm", changes={"sfm": {"part": 2, "gravity": "off"}})
-    assert seen["sfm"].earlier is not None
-    bring(job, "sfm", changes={"sfm": {"part": 2, "seed": 5}})
-    assert seen["sfm"].earlier is None
-    bring(job, "sfm", changes={"sfm": {"part": 3, "seed": 5}}, again=True)
-    assert seen["sfm"].earlier is None
-
-
 def test_another_part_makes_stale_what_comes_behind_and_the_same_one_nothing(job):
     assert stale(job) == {}
-    bring(job, "sfm", changes={"sfm": {"part": 2}})
+    assert bring(job, "sfm", "place", changes={"sfm": {"part": 2}}) == ["place"]
     assert list(stale(job)) == ["train", "prune", "evaluate", "export"]
-    assert stale(job_at(job.workspace.root, {"sfm": {"part": 1}}))["sfm"] == (
+    assert stale(job_at(job.workspace.root, {"sfm": {"part": 1}}))["place"] == (
         "sfm.part changed: 2 -> 1",)
+
+
+def test_views_that_sfm_made_before_place_was_a_stage_are_fresh(job):
+    root, now = job.workspace.root, job.workspace.manifest("place")
+    sfm = job.workspace.manifest("sfm")
+    shutil.rmtree(root / "sfm")
+    (root / "place").rename(root / "sfm")
+    (root / "sfm" / "undistorted").mkdir()
+    shutil.copy(root / "sfm" / "result.txt", root / "sfm" / "world.json")
+    outputs = {name: digest_file(root / "sfm" / name)
+               for name in ("result.txt", "world.json", "table.txt")}
+    old = dataclasses.replace(now, outputs=outputs, key=dataclasses.replace(
+        sfm.key, config={**sfm.key.config, **now.key.config},
+        upstream={name: now.key.upstream[name] for name in ("ingest", "denoise")}))
+    old.write(root / "sfm")
+    for name in ("train", "prune", "evaluate", "export"):
+        known = job.workspace.manifest(name)
+        dataclasses.replace(known, key=dataclasses.replace(known.key, upstream={
+            "sfm" if need == "place" else need: digest
+            for need, digest in known.key.upstream.items()})).write(root / name)
+    assert job.workspace.folder("place") == root / "sfm"
+    assert stale(job) == {}
+    assert bring(job, *NAMES) == []
+    assert list(stale(job_at(root, {"sfm": {"gravity": "off"}}))) == NAMES[NAMES.index("place"):]
+    assert bring(job, "place", changes={"sfm": {"gravity": "off"}}) == ["place"]
+    assert job.workspace.folder("place") == root / "place"
+    assert (root / "sfm" / "undistorted").is_dir()
+    assert "sfm" not in stale(job)

@@ -32,8 +32,8 @@ CONFIGS = {"train": TrainConfig(**RUN), "prune": PRUNE,
            "export": ExportConfig(format="spz", max_loss=3.0)}
 HELD_OUT = ("000000.png", "000004.png", "000008.png")
 INGEST = replace(records.INGEST, held_out=3, width=48, height=36)
-SFM = replace(
-    records.SFM, registered=12, lines=("12 of 12 images have a camera.", "Weakest link: 88%."),
+PLACE = replace(
+    records.PLACE, registered=12, lines=("12 of 12 images have a camera.", "Weakest link: 88%."),
     world=replace(records.WORLD, sentences=("z is up.",), evidence=replace(
         records.EVIDENCE, up_found=True, metres=True)))
 
@@ -53,7 +53,7 @@ def make_workspace(folder: Path) -> Path:
     made = folder / "made"
     inputs = make_inputs(made)
     (made / "ingest" / "frames").mkdir()
-    for path in (made / "sfm" / "undistorted" / "images").iterdir():
+    for path in (made / "place" / "undistorted" / "images").iterdir():
         shutil.copy(path, made / "ingest" / "frames" / path.name)
     for name, stage, config in (
             ("train", train, RunConfig(**RUN)), ("prune", prune, PRUNE),
@@ -61,7 +61,7 @@ def make_workspace(folder: Path) -> Path:
         (made / name).mkdir()
         summaries[name] = stage.run(config, inputs, made / name, CONTEXT)
         inputs = StageInputs({**inputs.folders, name: made / name})
-    summaries.update({"ingest": INGEST, "denoise": records.DENOISE, "sfm": SFM})
+    summaries.update({"ingest": INGEST, "denoise": records.DENOISE, "sfm": PLACE, "place": PLACE})
     prepared["folder"] = made
     (folder / "room.mp4").write_text("a video")
     bring(folder / "ws", *(row.name for row in TABLE), video=folder / "room.mp4")

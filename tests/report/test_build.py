@@ -173,7 +173,7 @@ def test_an_unfinished_run_is_said(workspace):
 
 
 def test_a_damaged_model_leaves_out_the_plan_alone(workspace):
-    (workspace / "sfm" / "undistorted" / "sparse" / "images.bin").write_bytes(b"short")
+    (workspace / "place" / "undistorted" / "sparse" / "images.bin").write_bytes(b"short")
     capture = section(page_of(workspace), "capture")
     assert "The plan is not shown: " in capture
     assert 'class="plan"' not in capture
@@ -221,12 +221,12 @@ def test_a_part_that_was_left_out_is_said_with_its_place_in_the_video(workspace)
             for i, name in enumerate(added)]
 
     change(workspace / "ingest" / "frames.json", add_frames)
-    manifest = Manifest.read(workspace / "sfm")
+    manifest = Manifest.read(workspace / "place")
     broken = "The model is broken between 000008.png and 000090.png."
     summary = {**manifest.run.summary, "left_out": added[:3],
                "lines": [broken, *manifest.run.summary["lines"]]}
     dataclasses.replace(
-        manifest, run=dataclasses.replace(manifest.run, summary=summary)).write(workspace / "sfm")
+        manifest, run=dataclasses.replace(manifest.run, summary=summary)).write(workspace / "place")
     change(workspace / "evaluate" / "metrics.json", lambda value: value.update(
         frames=16, training_views=8, unregistered=added, unregistered_test=added[1:2]))
     page = page_of(workspace)

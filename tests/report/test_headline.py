@@ -12,7 +12,7 @@ from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord
 
 
 def sfm(**summary):
-    run = RunRecord(1.0, 1, {**summaries.SFM.to_json(), **summary}, {}, None, None, 1, "")
+    run = RunRecord(1.0, 1, {**summaries.PLACE.to_json(), **summary}, {}, None, None, 1, "")
     return StageReport("sfm", Path("sfm"), "fresh", "", "recon sfm",
                     Manifest(ResultKey("sfm", 3, {}, (), {}), {}, "", run))
 

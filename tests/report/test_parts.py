@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from facts import assert_facts
-from report_workspace import SFM, bring, page_of, prepared, section, summaries
+from report_workspace import PLACE, bring, page_of, prepared, section, summaries
 
 from recon_cli.report.parts import advise, describe_time, find_moments
 from recon_cli.workspace.records import Frame
@@ -79,17 +79,17 @@ def in_parts(finished, tmp_path, monkeypatch):
     made = tmp_path / "made"
     shutil.copytree(finished.parent / "made", made)
     names = sorted(path.name for path in (made / "ingest" / "frames").iterdir())
-    sparse = made / "sfm" / "undistorted" / "sparse"
+    sparse = made / "place" / "undistorted" / "sparse"
     for copy in ("sparse", "parts/1", "parts/2"):
         shutil.copytree(sparse, made / "sfm" / copy, dirs_exist_ok=True)
     monkeypatch.setitem(prepared, "folder", made)
-    monkeypatch.setitem(summaries, "sfm", replace(
-        SFM, part=2, broken=("The model is broken.",), parts=(
+    monkeypatch.setitem(summaries, "place", replace(
+        PLACE, part=2, broken=("The model is broken.",), parts=(
             PartSummary(names=tuple(names[:7]), points=70),
             PartSummary(names=tuple(names[8:]), points=40))))
     video = tmp_path / "room.mp4"
     video.write_text("a video")
-    bring(tmp_path / "ws", "ingest", "denoise", "sfm", video=video)
+    bring(tmp_path / "ws", "ingest", "denoise", "sfm", "place", video=video)
     return tmp_path / "ws"
 
 

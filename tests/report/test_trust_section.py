@@ -59,7 +59,7 @@ def test_damaged_or_missing_files_are_said(workspace):
 
 def test_a_region_off_the_path_fits_into_the_plan(workspace):
     scene: Scene = read_scene(
-        workspace / "sfm" / "undistorted", held_out=frozenset(), validation=0.0)
+        workspace / "place" / "undistorted", held_out=frozenset(), validation=0.0)
     far = PoorlySeenRegion(**{**vars(REGION), "position": (30.0, -20.0, 1.0)})
     plan = str(draw_plan(scene, find_axes(scene, z_up=True), metres=False, regions=[far]))
     texts = plan.split('class="next" x="')[1]

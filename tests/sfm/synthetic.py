@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 
-from recon_cli.sfm.job import CameraGroup, MappingJob
+from recon_cli.sfm.job import CameraGroup, MappingJob, PlaceJob
 
 
 def make_capture(folder, *, frames=20, cameras=1, points=300, seed=0):
@@ -23,13 +23,20 @@ def make_capture(folder, *, frames=20, cameras=1, points=300, seed=0):
         truth = pycolmap.synthesize_dataset(options, database)
     names = tuple(sorted(truth.image(i).name for i in truth.reg_image_ids()))
     job = MappingJob(
-        frames=folder / "frames", denoised=folder / "frames", out=folder,
+        frames=folder / "frames", out=folder,
         groups=(CameraGroup(names, 1024, 768),), masks=None, poses=None, pose_use="keep",
         given_points=False, pairs="auto", max_features=2000, min_registered=0.5,
         accept_weak=False, partial=True,
-        gravity=True, scale_between=None,
         max_minutes=5.0, seed=0, threads=1, sharpness={}, times={})
     return job, truth
+
+
+def place_job(job, **changes):
+    """Places the model of a job as it is."""
+    return PlaceJob(**{
+        "frames": job.frames, "denoised": job.frames, "masks": job.masks, "models": job.parts,
+        "out": job.out, "parts": (job.names,), "poses": None, "pose_use": "ignore", "part": 1,
+        "gravity": True, "scale_between": None, "accept_weak": False, "threads": 2, **changes})
 
 
 def part(truth, names, *, motion=None):

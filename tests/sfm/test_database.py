@@ -35,10 +35,10 @@ def path(tmp_path):
     for name in NAMES:
         Image.new("RGB", (64, 48)).save(tmp_path / name)
     job = MappingJob(
-        frames=tmp_path, denoised=tmp_path, out=tmp_path, groups=(CameraGroup(NAMES, 64, 48),),
+        frames=tmp_path, out=tmp_path, groups=(CameraGroup(NAMES, 64, 48),),
         masks=None, poses=None, pose_use="keep", given_points=False, pairs="auto",
-        max_features=500, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
-        scale_between=None, max_minutes=1.0, seed=0, threads=1, sharpness={}, times={})
+        max_features=500, min_registered=0.5, accept_weak=False, partial=True,
+        max_minutes=1.0, seed=0, threads=1, sharpness={}, times={})
     create_database(job)
     write_features(job.database, (1, 2))
     write_matches(job.database, 1, 2)

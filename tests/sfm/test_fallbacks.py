@@ -212,7 +212,7 @@ def test_a_good_capture_stops_at_the_first_attempt(tmp_path):
     assert attempt.registered == 20
     assert attempt.kept
     part, = result.parts
-    assert part.registered == job.names
+    assert part.names == job.names
     assert result.models == (20,)
     assert not job.attempts.exists()
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
@@ -284,7 +284,7 @@ def test_a_mapper_is_skipped_by_the_work_that_is_left_and_by_no_clock(
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "the model cannot be trusted")
     result = build(replace(job, max_minutes=minutes))
     assert [bool(attempt.skipped) for attempt in result.attempts] == [False, skipped, skipped]
-    assert result.parts[0].registered == job.names
+    assert result.parts[0].names == job.names
 
 
 def test_the_work_of_a_further_mapper_grows_with_pairs_frames_and_attempts(capture):
@@ -305,7 +305,7 @@ def test_late_mappers_improve_no_model_that_is_enough_but_replace_one_that_is_no
     monkeypatch.setattr(fallbacks.checks, "check_registered", lambda *_: None)
     result = build(replace(job, min_registered=least, max_minutes=20.0, spare_minutes=0.0))
     assert [not attempt.skipped for attempt in result.attempts] == tried
-    assert result.parts[0].registered == job.names
+    assert result.parts[0].names == job.names
 
 
 @pytest.mark.parametrize(("held", "trusted", "minutes"), [
@@ -359,7 +359,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
         build(job)
     assert not (job.model).exists()
     monkeypatch.undo()
-    assert build(job).parts[0].registered == job.names
+    assert build(job).parts[0].names == job.names
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
 
 

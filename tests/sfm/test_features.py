@@ -32,10 +32,10 @@ def make_job(folder, pictures, **changes):
         write_png(folder / "frames" / name, picture)
     height, width = pictures[0].shape[:2]
     job = replace(MappingJob(
-        frames=folder / "frames", denoised=folder / "frames", out=folder,
+        frames=folder / "frames", out=folder,
         groups=(CameraGroup(names, width, height),), masks=None, poses=None,
         pose_use="keep", given_points=False, pairs="auto", max_features=5000,
-        min_registered=0.5, accept_weak=False, partial=True, gravity=True, scale_between=None,
+        min_registered=0.5, accept_weak=False, partial=True,
         max_minutes=1.0, seed=0, threads=2, sharpness={}, times={}), **changes)
     create_database(job)
     return job

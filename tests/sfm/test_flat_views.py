@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from synthetic import make_capture
+from synthetic import make_capture, place_job
 
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.face_frames import read_face_frames
@@ -97,7 +97,7 @@ def wide(tmp_path_factory):
             if spot.has_point3D():
                 local = pose[:, :3] @ model.point3D(spot.point3D_id).xyz + pose[:, 3]
                 image.points2D[place].xy = image.camera.img_from_cam(local[None])[0]
-    job = replace(job, threads=2, denoised=job.frames)
+    job = place_job(job)
     job.frames.mkdir(exist_ok=True)
     _, rays = frame_rays(model.image(next(iter(model.reg_image_ids()))).camera)
     for name in job.names:

@@ -12,6 +12,7 @@ from recon_cli.errors import FormatError, SfmError, WorkspaceError
 from recon_cli.scene.camera import Lens
 from recon_cli.sfm.job import (
     LOG_FILE,
+    SPLIT,
     STEPS,
     CameraGroup,
     MappingJob,
@@ -29,11 +30,10 @@ from recon_cli.sfm.results import CountedResult, SplitResult
 
 def job(count, pairs="auto"):
     return MappingJob(
-        frames=Path("/in/frames"), denoised=Path("/in/denoised"), out=Path("/out"),
+        frames=Path("/in/frames"), out=Path("/out"),
         groups=(CameraGroup(tuple(f"{index:06d}.png" for index in range(count)), 600, 340),),
         masks=None, poses=None, pose_use="keep", given_points=False, pairs=pairs,
         max_features=2048, min_registered=0.5, accept_weak=False, partial=True,
-        gravity=True, scale_between=None,
         max_minutes=1.0,
         seed=0, threads=2, sharpness={"000000.png": 12.5}, times={"000000.png": 0.25})
 
@@ -75,7 +75,7 @@ def test_poses_and_points_that_are_kept_leave_nothing_to_be_found():
     group = replace(job(4).groups[0], lens=lens)
     given = replace(
         job(4), poses=Path("/in/poses.json"), given_points=True, groups=(group,))
-    assert given.steps == ("model", "sparse", "undistorted")
+    assert given.steps == ("model",)
     assert replace(given, pose_use="refine").steps == STEPS
     assert replace(given, given_points=False).steps == STEPS
     assert replace(given, groups=(replace(group, lens=None),)).steps == STEPS
@@ -94,7 +94,7 @@ def finished(tmp_path):
     ledger = StepLog(tmp_path)
     for step in ("features", "matches"):
         ledger.finish(step, CountedResult(rows=3))
-    for step in ("model", "sparse", "undistorted"):
+    for step in ("split", "model"):
         (tmp_path / step / "images").mkdir(parents=True)
         (tmp_path / step / "images" / "a.bin").write_bytes(b"12345")
         ledger.finish(step, SplitResult(segments=((step,),)), tmp_path / step)
@@ -103,12 +103,12 @@ def finished(tmp_path):
 
 def done(folder):
     ledger = StepLog(folder)
-    return [step for step in STEPS if ledger.is_finished(step)]
+    return [step for step in (*STEPS[:2], SPLIT, *STEPS[2:]) if ledger.is_finished(step)]
 
 
 def test_results_are_read_back_by_the_next_process(finished):
     assert StepLog(finished).result("features", CountedResult) == CountedResult(rows=3)
-    assert StepLog(finished).result("undistorted", SplitResult).segments == (("undistorted",),)
+    assert StepLog(finished).result("model", SplitResult).segments == (("model",),)
 
 
 def test_a_result_of_another_version_is_as_good_as_none(finished):
@@ -120,13 +120,13 @@ def test_an_empty_folder_has_nothing_finished(tmp_path):
 
 
 def test_a_missing_file_takes_its_step_back(finished):
-    (finished / "sparse" / "images" / "a.bin").unlink()
-    assert done(finished) == ["features", "matches", "model", "undistorted"]
+    (finished / "split" / "images" / "a.bin").unlink()
+    assert done(finished) == ["features", "matches", "model"]
 
 
 def test_a_file_cut_short_takes_its_step_back(finished):
-    (finished / "undistorted" / "images" / "a.bin").write_bytes(b"123")
-    assert done(finished) == ["features", "matches", "model", "sparse"]
+    (finished / "model" / "images" / "a.bin").write_bytes(b"123")
+    assert done(finished) == ["features", "matches", "split"]
 
 
 def test_files_without_a_note_prove_nothing(finished):
@@ -141,8 +141,8 @@ def test_a_note_that_cannot_be_read_proves_nothing(finished):
 
 def test_a_flipped_byte_is_found_before_a_step_is_believed(finished):
     assert StepLog(finished).find_damage() is None
-    (finished / "sparse" / "images" / "a.bin").write_bytes(b"12375")
-    assert StepLog(finished).find_damage() == "sparse"
+    (finished / "split" / "images" / "a.bin").write_bytes(b"12375")
+    assert StepLog(finished).find_damage() == "split"
 
 
 def test_a_file_that_a_step_writes_besides_its_folder_is_looked_at_too(tmp_path):

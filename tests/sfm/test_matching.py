@@ -39,11 +39,10 @@ def job(tmp_path):
     for name in NAMES:
         Image.new("RGB", (64, 48)).save(tmp_path / "frames" / name)
     return MappingJob(
-        frames=tmp_path / "frames", denoised=tmp_path / "frames", out=tmp_path / "out",
+        frames=tmp_path / "frames", out=tmp_path / "out",
         groups=(CameraGroup(NAMES, 64, 48),), masks=None, poses=None,
         pose_use="keep", given_points=False, pairs="auto", max_features=500,
         min_registered=0.5, accept_weak=False, partial=True,
-        gravity=True, scale_between=None,
         max_minutes=1.0, seed=0, threads=1,
         sharpness={}, times={})
 

@@ -61,11 +61,11 @@ def job(tmp_path):
     Tracks(names, image, track.astype(np.int32), np.zeros((180, 2), np.float32)).write(
         tmp_path / "tracks")
     return MappingJob(
-        frames=tmp_path, denoised=tmp_path, out=tmp_path / "out",
+        frames=tmp_path, out=tmp_path / "out",
         groups=(CameraGroup(names[:40], 9, 9), CameraGroup(names[40:], 9, 9)), masks=None,
         poses=None, pose_use="keep", given_points=False, tracks=tmp_path / "tracks", pairs="auto",
-        max_features=2000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
-        scale_between=None, max_minutes=5.0, seed=0, threads=4, sharpness={},
+        max_features=2000, min_registered=0.5, accept_weak=False, partial=True,
+        max_minutes=5.0, seed=0, threads=4, sharpness={},
         times={name: float(index) for index, name in enumerate(names)})
 
 

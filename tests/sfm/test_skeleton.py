@@ -68,12 +68,12 @@ def make_job(folder, made, tracks=None):
             opened.update_keypoints(index, shaped)
     (folder / "rungs").mkdir()
     return MappingJob(
-        frames=folder, denoised=folder, out=folder,
+        frames=folder, out=folder,
         groups=(CameraGroup(tuple(made.names), WIDTH, HEIGHT),), masks=None, poses=None,
         pose_use="keep", given_points=False,
         tracks=None if tracks is None else folder / "tracks.safetensors", pairs="auto",
-        max_features=2000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
-        scale_between=None, max_minutes=5.0, seed=0, threads=1, sharpness={}, times={})
+        max_features=2000, min_registered=0.5, accept_weak=False, partial=True,
+        max_minutes=5.0, seed=0, threads=1, sharpness={}, times={})
 
 
 def linked(job):

@@ -20,10 +20,10 @@ def prepare(made, folder, **changes):
     """Returns the job, and the model with the verdict on it."""
     made.write_database(folder / "database.db")
     job = MappingJob(
-        frames=folder, denoised=folder, out=folder, groups=(CameraGroup(made.names, 600, 400),),
+        frames=folder, out=folder, groups=(CameraGroup(made.names, 600, 400),),
         masks=None, poses=None, pose_use="keep", given_points=False, pairs="auto",
-        max_features=2000, min_registered=0.5, accept_weak=False, partial=True, gravity=True,
-        scale_between=None, max_minutes=5.0, seed=0, threads=1, sharpness={},
+        max_features=2000, min_registered=0.5, accept_weak=False, partial=True,
+        max_minutes=5.0, seed=0, threads=1, sharpness={},
         times={name: float(index) for index, name in enumerate(made.names)})
     job, model = replace(job, **changes), made.model()
     return job, ModelCandidate(

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from sfm_inputs import texture
-from synthetic import make_capture
+from synthetic import make_capture, place_job
 
 from recon_cli.io.images import read_png, write_png
 from recon_cli.sfm.job import Phase, Reporter, parse
@@ -29,7 +29,7 @@ def mapped(tmp_path):
             shown = texture(HEIGHT, WIDTH, seed)
             write_png(tmp_path / folder / name, shown // 2 if (folder, seed) == (
                 "denoised", 1) else shown)
-    return replace(job, denoised=tmp_path / "denoised", threads=2), model
+    return place_job(job, denoised=tmp_path / "denoised"), model
 
 
 def run(job, model, params=(), report=None):

@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from panoramas import HEIGHT, WIDTH, make_panoramas
 from scipy.spatial.transform import Rotation
+from synthetic import place_job
 
 from recon_cli.io.colmap import read_scene
 from recon_cli.io.face_frames import read_face_frames
@@ -41,7 +42,7 @@ def faces(tmp_path_factory):
             write_png(job.masks / name, mask)
     (job.out / "sparse").mkdir()
     model.write(job.out / "sparse")
-    undistort.undistort(job, Reporter(io.BytesIO()))
+    undistort.undistort(place_job(job), Reporter(io.BytesIO()))
     return job.out / "undistorted", job, model
 
 

@@ -155,7 +155,7 @@ def test_a_lens_that_was_asked_for_wrongly_is_refused_with_the_right_one(tmp_pat
     kept = fallbacks.build_model(dataclasses.replace(job, accept_weak=True),
                                  Reporter(io.BytesIO()))
     assert kept.broken == ()
-    assert kept.parts[0].registered == job.names
+    assert kept.parts[0].names == job.names
 
 
 def test_an_ordinary_capture_is_mapped_as_before(tmp_path):
@@ -173,7 +173,8 @@ def test_matches_of_a_named_fisheye_are_verified_without_its_focal_length_at_fir
     job, _ = capture_of(tmp_path, FISHEYE, points=60)
     named = dataclasses.replace(job.groups[0], model="OPENCV_FISHEYE")
     assert matching.first_model(job, named) == "OPENCV"
-    assert matching.first_model(dataclasses.replace(job, last="model"), named) == "OPENCV_FISHEYE"
+    segment = dataclasses.replace(job, is_segment=True)
+    assert matching.first_model(segment, named) == "OPENCV_FISHEYE"
     radial = dataclasses.replace(named, model="RADIAL")
     assert matching.first_model(job, radial) == "RADIAL"
     assert matching.first_model(job, job.groups[0]) == "OPENCV"
@@ -182,7 +183,7 @@ def test_matches_of_a_named_fisheye_are_verified_without_its_focal_length_at_fir
 def test_segments_stay_with_one_model_of_lenses_and_say_so(tmp_path):
     job, _ = capture_of(tmp_path, FISHEYE)
     ways, stream = fallbacks.list_fallbacks(job), io.BytesIO()
-    segment = dataclasses.replace(job, last="model")
+    segment = dataclasses.replace(job, is_segment=True)
     assert fallbacks._begin_with_fisheye(segment, ways, Reporter(stream)) is ways
     assert not stream.getvalue()
     joined = dataclasses.replace(job, segments=(job.names[:5], job.names[3:]))

@@ -15,7 +15,7 @@ BuildOnce = Callable[[str, Callable[[Path], object]], Path]
 
 def finished(folder: Path, *names: str) -> StageInputs:
     """The folders of finished stages."""
-    return StageInputs({name: folder / name for name in ("ingest", "sfm", *names)})
+    return StageInputs({name: folder / name for name in ("ingest", "place", *names)})
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,8 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.io.images import write_png
 from recon_cli.sfm.job import Reporter
 from recon_cli.sfm.mapping import process, worker
-from recon_cli.stages import sfm
+from recon_cli.sfm.views import undistort
+from recon_cli.stages import place, sfm
 from recon_cli.workspace.records import Frame, FrameList, Group
 
 
@@ -48,8 +49,19 @@ def write_inputs(base, images, *, filtered=(), held_out=(), fps=None):
 
 def run(base, out, *, ctx=None, **options):
     out.mkdir(exist_ok=True)
-    inputs = StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"})
-    return sfm.run(SfmConfig(**options), inputs, out, ctx or StageContext(threads=2))
+    """Maps the frames and places a part of them, in one folder; returns the summary of place."""
+    ctx, config = ctx or StageContext(threads=2), SfmConfig(**options)
+    found = sfm.run(config, StageInputs({"ingest": base / "ingest"}), out, ctx)
+    return run_place(base, out, found, out, ctx=ctx, **options)
+
+
+def run_place(base, mapped, found, out, *, ctx=None, **options):
+    """Places a part of what was found into `out`."""
+    out.mkdir(exist_ok=True)
+    inputs = StageInputs(
+        {"ingest": base / "ingest", "denoise": base / "denoise", "sfm": mapped},
+        summaries={"sfm": found.to_json()})
+    return place.run(SfmConfig(**options), inputs, out, ctx or StageContext(threads=2))
 
 
 @contextmanager
@@ -57,6 +69,7 @@ def mapping_here() -> Iterator[None]:
     """Maps in this process: to start another one takes longer than a small capture does."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(process, "run_job", lambda job, **_: worker.work(job, Reporter(io.BytesIO())))
+        patch.setattr(process, "_run", lambda job, *_: undistort.place(job, Reporter(io.BytesIO())))
         yield
 
 

@@ -134,7 +134,7 @@ SHORT = replace(tiny_stages.CONFIG, iterations=12, max_gaussians=60, checkpoint_
 def short(build_once: Callable[[str, Callable[[Path], object]], Path]) -> StageInputs:
     """ingest, sfm, and a finished train of a few steps."""
     folder = build_once("tiny-short", lambda to: tiny_stages.trained(to, SHORT))
-    return StageInputs({name: folder / name for name in ("ingest", "sfm", "train")})
+    return StageInputs({name: folder / name for name in ("ingest", "place", "train")})
 
 
 @pytest.mark.integration

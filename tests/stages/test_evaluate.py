@@ -42,7 +42,7 @@ def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):
         for view in model["views"]:
             shown = read_image(out / "renders" / name / view["name"], 48, 36)
             truth = read_image(out / "truth" / view["name"], 48, 36)
-            original = inputs.folders["sfm"] / "undistorted" / "images" / view["name"]
+            original = inputs.folders["place"] / "undistorted" / "images" / view["name"]
             assert np.array_equal(truth, read_image(original, 48, 36))
             image = (shown / 255.0).astype(np.float32)
             assert view["psnr_8bit_db"] == pytest.approx(psnr(image, truth), abs=1e-5)
@@ -82,11 +82,11 @@ def test_views_that_training_saw_are_scored_beside_the_held_out_ones(inputs, tmp
 def test_scores_are_against_the_original_pixels_also_where_training_saw_denoised_ones(
     inputs, tmp_path
 ):
-    folder = tmp_path / "sfm"
-    shutil.copytree(inputs.folders["sfm"], folder)
+    folder = tmp_path / "place"
+    shutil.copytree(inputs.folders["place"], folder)
     for path in (folder / "undistorted" / "denoised").iterdir():
         path.write_bytes((folder / "undistorted" / "denoised" / "000001.png").read_bytes())
-    changed = StageInputs({**inputs.folders, "sfm": folder})
+    changed = StageInputs({**inputs.folders, "place": folder})
     run(evaluate, EvaluateConfig(), inputs, tmp_path / "a")
     run(evaluate, EvaluateConfig(), changed, tmp_path / "b")
     first, second = (json.loads((tmp_path / name / "metrics.json").read_text())["models"]["base"]
@@ -193,14 +193,14 @@ def test_trust_renders_no_view_again_that_scoring_rendered(inputs, tmp_path, mon
 
 
 def test_held_out_views_calibrate_nothing(inputs, tmp_path):
-    changed = tmp_path / "sfm"
-    shutil.copytree(inputs.folders["sfm"], changed)
+    changed = tmp_path / "place"
+    shutil.copytree(inputs.folders["place"], changed)
     for i in range(0, VIEWS, 4):
         path = changed / "undistorted" / "images" / f"{i:06d}.png"
         write_png(path, 255 - read_image(path, 48, 36))
     records = []
-    for number, sfm in enumerate((inputs.folders["sfm"], changed)):
-        given = without(StageInputs({**inputs.folders, "sfm": sfm}), "prune")
+    for number, sfm in enumerate((inputs.folders["place"], changed)):
+        given = without(StageInputs({**inputs.folders, "place": sfm}), "prune")
         run(evaluate, EvaluateConfig(), given, tmp_path / f"out{number}")
         records.append(TrustRecord.read(tmp_path / f"out{number}"))
     assert records[0].base.error == records[1].base.error

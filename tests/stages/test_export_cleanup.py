@@ -109,7 +109,7 @@ def test_a_scene_in_another_frame_is_not_cleaned_by_the_views(given, tmp_path):
     write_ply(tmp_path / "away.ply", away)
     (tmp_path / "train").mkdir()
     import_scene.run(ImportConfig(), StageInputs(
-        {name: inputs.folders[name] for name in ("ingest", "sfm")}, (tmp_path / "away.ply",)),
+        {name: inputs.folders[name] for name in ("ingest", "place")}, (tmp_path / "away.ply",)),
         tmp_path / "train", CONTEXT)
     with pytest.raises(StageError, match="--drop-floaters needs views"):
         exported(StageInputs({**inputs.folders, "train": tmp_path / "train"}), tmp_path,

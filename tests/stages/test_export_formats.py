@@ -56,7 +56,7 @@ def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported, inp
 def test_cameras_are_those_of_the_scene(exported, inputs):
     out, _ = exported
     found = {name: viewmat for name, _, viewmat in read_images(out / "sparse" / "0" / "images.bin")}
-    sparse = inputs.folders["sfm"] / "undistorted" / "sparse"
+    sparse = inputs.folders["place"] / "undistorted" / "sparse"
     for name, _, viewmat in read_images(sparse / "images.bin"):
         assert np.allclose(found[name], viewmat, atol=1e-12)
     transforms = json.loads((out / "transforms.json").read_text())
@@ -71,7 +71,7 @@ def test_the_images_of_the_cameras_lie_beside_them(exported, inputs):
     transforms = json.loads((out / "transforms.json").read_text())
     for frame in transforms["frames"]:
         image = out / frame["file_path"]
-        original = inputs.folders["sfm"] / "undistorted" / "images" / image.name
+        original = inputs.folders["place"] / "undistorted" / "images" / image.name
         assert image.read_bytes() == original.read_bytes()
 
 

@@ -55,7 +55,7 @@ def inputs(tmp_path):
 
 def up_is_z(inputs):
     world = replace(summaries.WORLD, evidence=replace(summaries.EVIDENCE, up_found=True))
-    write_json(inputs.folders["sfm"] / "world.json", world.to_json())
+    write_json(inputs.folders["place"] / "world.json", world.to_json())
 
 
 def exported(inputs, **options):
@@ -107,7 +107,7 @@ def test_files_and_cameras_that_are_handed_out_show_the_same_pictures(inputs, op
     out, _ = exported(
         inputs, format="compressed.ply,spz,glb,html,colmap,transforms.json", **options)
     before = pictures(read_ply(inputs.folders["train"] / "splats.ply"),
-                      of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse"))
+                      of_colmap(inputs.folders["place"] / "undistorted" / "sparse"))
     for cameras in (of_colmap(out / "sparse" / "0"), of_transforms(out / "transforms.json")):
         for name in ("ply", "glb"):
             after = pictures(read_splats(out / f"splats.{name}"), cameras)
@@ -121,7 +121,7 @@ def test_harmonics_that_did_not_turn_would_be_seen(inputs):
     """The bound above means nothing unless this exceeds it."""
     out, _ = exported(inputs, format="colmap", transform=flat(MOVED))
     before = pictures(read_ply(inputs.folders["train"] / "splats.ply"),
-                      of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse"))
+                      of_colmap(inputs.folders["place"] / "undistorted" / "sparse"))
     after = read_ply(out / "splats.ply")
     after.sh_rest = read_ply(inputs.folders["train"] / "splats.ply").sh_rest
     assert most_apart(before, pictures(after, of_colmap(out / "sparse" / "0"))) > 0.2
@@ -129,7 +129,7 @@ def test_harmonics_that_did_not_turn_would_be_seen(inputs):
 
 def test_points_move_with_the_scene(inputs):
     out, _ = exported(inputs, format="points.ply,colmap", transform=flat(MOVED))
-    own, _ = read_points(inputs.folders["sfm"] / "undistorted" / "sparse" / "points3D.bin")
+    own, _ = read_points(inputs.folders["place"] / "undistorted" / "sparse" / "points3D.bin")
     sparse, _ = read_points(out / "sparse" / "0" / "points3D.bin")
     assert np.allclose(np.sort(sparse, axis=0), np.sort(MOVED.points(own), axis=0))
     points, _ = read_ply_points(out / "points.ply")
@@ -203,7 +203,7 @@ def test_a_page_stands_upright_in_any_frame(inputs):
     value = json.loads(text[start:text.index("</script>", start)])
     assert np.allclose(value["up"], TURN @ [0, 0, 1])
     scene = load_scene(inputs.folders, validation=read_config(inputs.folders["train"]).validation)
-    cameras = of_colmap(inputs.folders["sfm"] / "undistorted" / "sparse")
+    cameras = of_colmap(inputs.folders["place"] / "undistorted" / "sparse")
     train = sorted(view.name for view in scene.train)
     for view, name in zip(value["views"], train, strict=True):
         pose = np.array(view["pose"]).reshape(3, 4)

@@ -90,12 +90,12 @@ def know_scale(inputs, **more):
     viewmats = {f"{at:06d}.png": np.eye(4) for at in range(3)}
     world = world_transform(np.zeros((0, 3)), viewmats, gravity=True, given_up=(0.0, 0.0, 1.0),
                             **{"scale_between": None, "metric": True, **more})
-    (inputs.folders["sfm"] / "world.json").write_text(json.dumps(world.summary().to_json()))
+    (inputs.folders["place"] / "world.json").write_text(json.dumps(world.summary().to_json()))
 
 
 def spread_scale(inputs, spread):
     """Says how far the scales of two parts of the capture may differ."""
-    path = inputs.folders["sfm"] / "world.json"
+    path = inputs.folders["place"] / "world.json"
     world = json.loads(path.read_text())
     world["evidence"]["scale_spread"] = spread
     path.write_text(json.dumps(world))

@@ -41,7 +41,7 @@ CONTEXT = StageContext(backend="numba")
 def inputs(tmp_path):
     given = make_inputs(tmp_path / "views")
     world = replace(summaries.WORLD, similarity=WORLD.to_json())
-    write_json(given.folders["sfm"] / "world.json", world.to_json())
+    write_json(given.folders["place"] / "world.json", world.to_json())
     return given
 
 
@@ -251,7 +251,7 @@ def test_a_scene_in_map_coordinates_fits_cameras_that_are_in_them_too(inputs, tm
     place = np.array([448262.25, 5411932.5, 301.5])
     world = Similarity(translation=-place)
     record = replace(summaries.WORLD, similarity=world.to_json())
-    write_json(inputs.folders["sfm"] / "world.json", record.to_json())
+    write_json(inputs.folders["place"] / "world.json", record.to_json())
     summary = brought_in(far_away(tmp_path / "a.ply", place), inputs, tmp_path / "train")
     assert summary.frame == "source"
     assert summary.training_psnr_db > 40

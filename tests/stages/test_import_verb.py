@@ -147,11 +147,11 @@ def test_views_that_come_later_make_the_scene_stale_until_it_is_held_against_the
     workspace, scene, capsys
 ):
     away = workspace.parent / "away"
-    for name in ("ingest", "sfm"):
+    for name in ("ingest", "place"):
         away.mkdir(exist_ok=True)
         (workspace / name).rename(away / name)
     assert recon("import", workspace, scene) == 0
-    for name in ("ingest", "sfm"):
+    for name in ("ingest", "place"):
         (away / name).rename(workspace / name)
     assert set(train_of(workspace).reasons) == {"ingest was missing", "sfm was missing"}
     assert recon("eval", workspace) == 4

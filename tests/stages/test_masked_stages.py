@@ -46,7 +46,7 @@ def spoil(inputs, seed):
     rng = np.random.default_rng(seed)
     for folder in ("images", "denoised"):
         for name in (TRAINED, VALIDATED, SCORED):
-            path = inputs.folders["sfm"] / "undistorted" / folder / name
+            path = inputs.folders["place"] / "undistorted" / folder / name
             image = read_image(path, 48, 36)
             image[~ALL_BUT_A_CORNER] = rng.integers(0, 256, 3)
             write_png(path, image)
@@ -131,9 +131,9 @@ def test_a_killed_training_with_masks_ends_with_the_bytes_of_an_uninterrupted_on
 
 def copied(inputs, tmp_path, masks):
     """The same inputs with further masks."""
-    folder = tmp_path / "sfm"
-    shutil.copytree(inputs.folders["sfm"], folder)
-    changed = StageInputs({**inputs.folders, "sfm": folder})
+    folder = tmp_path / "place"
+    shutil.copytree(inputs.folders["place"], folder)
+    changed = StageInputs({**inputs.folders, "place": folder})
     write_masks(changed, masks)
     return changed
 

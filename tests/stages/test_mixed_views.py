@@ -57,7 +57,7 @@ def test_views_of_both_cameras_are_learned_and_scored_at_their_own_size(done, tm
         for view in metrics["models"][model]["views"]:
             width, height = SIZES[view["name"]]
             truth = read_image(
-                inputs.folders["sfm"] / "undistorted" / "images" / view["name"], width, height)
+                inputs.folders["place"] / "undistorted" / "images" / view["name"], width, height)
             render = read_image(tmp_path / "out" / "renders" / model / view["name"], width, height)
             assert view["psnr_db"] > mean_colour_psnr(truth) + least
             assert view["psnr_db"] == pytest.approx(

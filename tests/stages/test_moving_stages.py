@@ -52,7 +52,7 @@ def test_pixels_under_a_users_mask_change_nothing_in_training_or_pruning(inputs,
         results.append([(tmp_path / name / stage / "splats.ply").read_bytes()
                         for stage in ("train", "prune")])
         for kind in ("images", "denoised"):
-            path = inputs.folders["sfm"] / "undistorted" / kind / MASKED
+            path = inputs.folders["place"] / "undistorted" / kind / MASKED
             pixels = np.zeros((36, 48, 3), np.uint8)
             pixels[:, 24:] = _read(path)[:, 24:]
             write_png(path, pixels)

@@ -24,7 +24,7 @@ def test_a_walk_of_panoramas_becomes_cameras_faces_and_scores(tmp_path, shared_d
     options = ["-w", str(workspace), "--quiet"]
     assert main(["ingest", str(tmp_path / "walk"), "--max-size", "384", *options]) == 0
     assert main(["sfm", *options]) == 0
-    model = pycolmap.Reconstruction(workspace / "sfm" / "sparse")
+    model = pycolmap.Reconstruction(workspace / "place" / "sparse")
     assert model.num_reg_images() == len(pictures)
     images = [model.find_image_with_name(f"{path.stem}.png") for path in pictures]
     found = np.array([
@@ -33,7 +33,7 @@ def test_a_walk_of_panoramas_becomes_cameras_faces_and_scores(tmp_path, shared_d
     model.transform(align_to_given(found, np.linalg.inv(truth)))
     off = np.array([image.projection_center() for image in images]) - truth[:, :3, 3]
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.003  # metres
-    faces = sorted((workspace / "sfm" / "undistorted" / "images").iterdir())
+    faces = sorted((workspace / "place" / "undistorted" / "images").iterdir())
     assert len(faces) == len(CUBE) * len(pictures)
     assert main(["train", "--iterations", "60", "--max-size", "128", *options]) == 0
     assert main(["eval", "--no-trust", *options]) == 0

@@ -22,7 +22,7 @@ from recon_cli.io.images import read_png
 from recon_cli.sfm import database
 from recon_cli.sfm.job import STEPS
 from recon_cli.workspace.atomic import clear_leftovers
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import PlaceSummary
 
 STEP, COUNT = 4, 12  # every 4th frame of the sample: few, and each still overlaps the next
 BLANK = "000099.png"  # a grey frame, held out, that can find no camera
@@ -39,7 +39,7 @@ from recon_cli.stages import sfm
 from recon_cli.context import StageContext, StageInputs
 base = Path(sys.argv[1])
 sfm.run(SfmConfig(max_features=int(sys.argv[3])),
-        StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"}), Path(sys.argv[2]),
+        StageInputs({"ingest": base / "ingest"}), Path(sys.argv[2]),
         StageContext(threads=2))
 """
 
@@ -80,13 +80,13 @@ def test_every_frame_that_shows_the_room_gets_a_camera(mapped):
 def test_the_summary_is_json_and_has_plausible_figures(mapped):
     _, summary, _ = mapped
     text = json.dumps(summary.to_json(), allow_nan=False)
-    assert SfmSummary.from_json(json.loads(text)) == summary
+    assert PlaceSummary.from_json(json.loads(text)) == summary
     assert summary.points > 300
     assert summary.mean_track_length > 2
     assert 0 < summary.reprojection_error_px < 1
     assert summary.median_triangulation_angle_deg > 5
     assert summary.models[0] == COUNT
-    assert set(summary.seconds) == {"features", "matches", "model", "sparse", "undistorted"}
+    assert set(summary.seconds) == {"features", "matches", "model"}
     camera, = summary.cameras
     assert camera["frames"] == COUNT
     assert camera["focal_px"] == pytest.approx(300, rel=0.03)  # the room was rendered with 300
@@ -213,8 +213,6 @@ def test_a_run_killed_in_every_step_ends_with_the_bytes_of_one_that_was_not(
     kill_when(room, out, lambda: rows_written(out / "database.db", "features") >= 3)
     kill_when(room, out, lambda: rows_written(out / "database.db", "matches") >= 5)
     kill_when(room, out, lambda: noted(out, "matches"))
-    kill_when(room, out, lambda: (
-        noted(out, "sparse") and any((out / "undistorted.partial").rglob("*.png"))))
     run(room, out, max_features=FEATURES)
     assert not [  # a list: of blobs that differ pytest would print every byte
         table for table in ("keypoints", "descriptors", "matches", "two_view_geometries")
@@ -260,9 +258,9 @@ def read_pairs(out):
 
 def test_a_finished_run_is_not_done_again(mapped, room):
     out, summary, _ = mapped
-    before = (out / "undistorted").stat().st_ino, (out / "sparse").stat().st_ino
+    before = (out / "parts").stat().st_ino
     assert run(room, out, max_features=FEATURES) == summary
-    assert ((out / "undistorted").stat().st_ino, (out / "sparse").stat().st_ino) == before
+    assert (out / "parts").stat().st_ino == before
 
 
 def test_running_out_of_time_is_a_failure_that_says_where_it_was(room, tmp_path):
@@ -309,7 +307,6 @@ def test_ctrl_c_in_every_step_ends_the_mapping_process_at_once(room, tmp_path):
         lambda: rows_written(out / "database.db", "features") >= 3,
         lambda: rows_written(out / "database.db", "matches") >= 5,
         lambda: noted(out, "matches"),
-        lambda: noted(out, "sparse") and any((out / "undistorted.partial").rglob("*.png")),
     ):
         parent = subprocess.Popen(
             [sys.executable, "-c", RUN, str(room), str(out), str(FEATURES)],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import summaries
 from facts import assert_facts
-from sfm_inputs import run, run_here, texture, turning, write_inputs
+from sfm_inputs import run, run_here, run_place, texture, turning, write_inputs
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
@@ -16,11 +16,17 @@ from recon_cli.errors import ConfigError, FormatError, SfmError
 from recon_cli.sfm import database
 from recon_cli.sfm.job import CameraGroup
 from recon_cli.sfm.mapping import time_estimate
-from recon_cli.sfm.results import MappingResult, ModelResult, PartResult
+from recon_cli.sfm.results import MappingResult, ModelResult
 from recon_cli.sfm.segments.segments import SegmentRuns
-from recon_cli.stages import sfm
+from recon_cli.stages import place, sfm
 from recon_cli.workspace.records import Frame, FrameList, Group
-from recon_cli.workspace.summaries import AttemptSummary, PosesSummary
+from recon_cli.workspace.summaries import (
+    AttemptSummary,
+    PartSummary,
+    PlacedPart,
+    PosesSummary,
+    SfmSummary,
+)
 
 
 def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
@@ -96,8 +102,10 @@ def test_a_missing_twin_is_found_before_anything_is_done(tmp_path):
     base = write_inputs(
         tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
     (base / "denoise" / "frames" / "1.png").unlink()
+    found = SfmSummary(frames=3, poses=None, models=(3,), apart=(), attempts=(), seconds={}, parts=(
+        PartSummary(names=("0.png", "1.png", "2.png"), points=9),))
     with pytest.raises(FormatError, match=r"lacks 1 of 3 frames: 1\.png") as caught:
-        run(base, tmp_path / "out")
+        run_place(base, tmp_path / "sfm", found, tmp_path / "out")
     assert "recon denoise" in caught.value.hint
     assert not (tmp_path / "out" / "log.txt").exists()
 
@@ -120,13 +128,13 @@ def attempt(name, **fields):
 def told(caplog, **changes):
     """What the stage says of a summary."""
     summary = replace(
-        summaries.SFM, frames=60, unregistered=tuple(f"{i}.png" for i in range(11)), models=(49,),
+        summaries.PLACE, frames=60, unregistered=tuple(f"{i}.png" for i in range(11)), models=(49,),
         attempts=(attempt("exhaustive", registered=40),))
     names = sorted(f"{index}.png" for index in range(60))
     frames = FrameList("video", (Group("a.mp4", 60, 40),), tuple(
         Frame(name, index / 2, "a.mp4", None, held_out=False) for index, name in enumerate(names)))
     caplog.set_level(logging.DEBUG, logger="recon")
-    sfm._report(replace(summary, **changes), frames, StageContext())
+    place._report(replace(summary, **changes), frames, StageContext())
     return caplog.text
 
 
@@ -197,7 +205,7 @@ def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monke
 
 def test_a_problem_of_the_model_before_goes_on_within_the_sentence():
     broken = attempt("global", reason="The model is broken.", registered=9)
-    line, = sfm._attempts([attempt("exhaustive"), broken])
+    line, = place._attempts([attempt("exhaustive"), broken])
     assert_facts(line, "global", "the model is broken", "9 frames")
     assert ".:" not in line
 
@@ -206,13 +214,14 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted():
     names = [f"{index}.png" for index in range(6)]
     frames = FrameList("video", (Group("a.mp4", 64, 48),), tuple(
         Frame(name, None, "a.mp4", None, held_out=name in ("0.png", "4.png")) for name in names))
-    part = PartResult(
-        registered=tuple(names[:3]), points=9, mean_track_length=None, reprojection_error_px=None,
-        median_triangulation_angle_deg=None, rejected={}, verdict=None, lines=())
+    part = PartSummary(names=tuple(names[:3]), points=9)
     model = ModelResult(parts=(part,), models=(3,), left_out=tuple(names[3:5]))
-    job = SimpleNamespace(segments=(), part=1)
-    summary = sfm._summary(
-        frames, SegmentRuns(job, {}, {}), MappingResult(model, summaries.WORLD, (), {}, {}))
+    found = sfm._summary(frames, SegmentRuns(SimpleNamespace(segments=()), {}, {}),
+                         MappingResult(model, {}, {}))
+    summary = place._summary(frames, found, 1, PlacedPart(
+        points=9, mean_track_length=None, reprojection_error_px=None,
+        median_triangulation_angle_deg=None, verdict=None, lines=(), world=summaries.WORLD,
+        cameras=()))
     assert summary.left_out == ("3.png", "4.png")
     assert summary.unregistered == ("3.png", "4.png", "5.png")  # no mapper found a place for 5
     assert summary.unregistered_held_out == ("4.png",)

@@ -1,24 +1,22 @@
 """A capture in two parts: the larger is placed, and the other taken without mapping again."""
 
 import json
-import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from facts import assert_facts
 from made_model import MadeModel, along, wall
-from sfm_inputs import mapping_here, write_inputs
+from sfm_inputs import mapping_here, run_place, write_inputs
 
 from recon_cli.config.stages import SfmConfig
-from recon_cli.context import EarlierResult, StageContext, StageInputs
+from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images
 from recon_cli.sfm import database
 from recon_cli.sfm.job import StepLog
-from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
+from recon_cli.sfm.results import FeaturesResult, MatchesResult
 from recon_cli.stages import sfm
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import PlaceSummary
 
 # Two walks along two walls that have nothing in common.
 LARGE, SMALL = 12, 10
@@ -47,108 +45,92 @@ def matched(out):
     return out
 
 
-def run(base, out, *, earlier=None, **options):
-    """Runs the stage on what is there; all pairs are matched."""
+def run(base, out, **options):
+    """Maps what is there; all pairs are matched."""
     out.mkdir(exist_ok=True)
-    inputs = StageInputs({"ingest": base / "ingest", "denoise": base / "denoise"}, earlier=earlier)
     with mapping_here():
-        return sfm.run(
-            SfmConfig(pairs="exhaustive", **options), inputs, out, StageContext(threads=1))
-
-
-def result_of(mapped, **changes):
-    out, summary = mapped
-    return EarlierResult(out, summary.to_json(), **changes)
+        return sfm.run(SfmConfig(pairs="exhaustive", **options),
+                       StageInputs({"ingest": base / "ingest"}), out, StageContext(threads=1))
 
 
 @pytest.fixture(scope="module")
 def mapped(base, tmp_path_factory):
-    """(folder, summary) of a finished result."""
+    """(folder, summary) of a finished result of sfm."""
     out = matched(tmp_path_factory.mktemp("mapped") / "out")
     return out, run(base, out)
+
+
+def place(base, mapped, out, **options):
+    """Places a part of it in this process."""
+    with mapping_here():
+        return run_place(base, *mapped, out, **options)
+
+
+@pytest.fixture(scope="module")
+def first(base, mapped, tmp_path_factory):
+    """(folder, summary) of its first part, placed."""
+    out = tmp_path_factory.mktemp("first") / "out"
+    return out, place(base, mapped, out)
 
 
 def placed(out):
     return tuple(name for name, *_ in read_images(out / "sparse" / "images.bin"))
 
 
-def test_the_largest_part_is_placed_and_the_other_one_is_kept(mapped):
-    out, summary = mapped
-    assert tuple(part.names for part in summary.parts) == PARTS
+def test_the_largest_part_is_placed_and_the_other_one_is_kept(mapped, first):
+    found, summary = mapped[1], first[1]
+    assert tuple(part.names for part in found.parts) == PARTS
+    assert sorted(path.name for path in (mapped[0] / "parts").iterdir()) == ["1", "2"]
+    assert {tuple(name for name, *_ in read_images(mapped[0] / "parts" / number / "images.bin"))
+            for number in "12"} == set(PARTS)
     assert summary.part == 1
     assert summary.registered == LARGE
-    assert placed(out) == PARTS[0]
-    assert sorted(path.name for path in (out / "parts").iterdir()) == ["1", "2"]
-    assert {tuple(name for name, *_ in read_images(out / "parts" / number / "images.bin"))
-            for number in "12"} == set(PARTS)
+    assert placed(first[0]) == PARTS[0]
     assert summary.unregistered == PARTS[1]
     assert summary.unregistered_held_out == ("000015.png", "000020.png")
     assert not summary.apart
     assert not summary.left_out
     assert summary.trusted
-    assert SfmSummary.from_json(json.loads(json.dumps(summary.to_json()))) == summary
+    assert PlaceSummary.from_json(json.loads(json.dumps(summary.to_json()))) == summary
 
 
-def test_the_other_part_is_taken_without_mapping_again(mapped, base, tmp_path):
-    out, summary = mapped
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    taken = run(base, tmp_path / "out", earlier=result_of(mapped), part=2)
+def test_the_other_part_is_placed_from_the_same_models(mapped, first, base, tmp_path):
+    before = {path: path.read_bytes() for path in mapped[0].rglob("*") if path.is_file()}
+    taken = place(base, mapped, tmp_path / "out", part=2)
     assert placed(tmp_path / "out") == PARTS[1]
     assert taken.part == 2
-    assert taken.parts == summary.parts
+    assert taken.parts == first[1].parts
     assert taken.registered == SMALL
     assert taken.unregistered == PARTS[0]
     assert taken.unregistered_held_out == ("000000.png",)
-    assert {step: taken.seconds[step] for step in ("features", "matches", "model")} == {
-        step: summary.seconds[step] for step in ("features", "matches", "model")}
+    assert taken.seconds == mapped[1].seconds
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
     assert verdict["registered"] == SMALL
-    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    # and back again: the bytes of the first run
-    again = run(base, tmp_path / "back", earlier=result_of((tmp_path / "out", taken)))
-    assert again == replace(summary, seconds=again.seconds, cpu_seconds=again.cpu_seconds,
-                            world=again.world)
-    for folder in ("parts", "sparse", "undistorted"):
-        for path in (out / folder).rglob("*.bin"):
-            assert (tmp_path / "back" / path.relative_to(out)).read_bytes() == path.read_bytes()
-
-
-def test_axes_are_chosen_anew_without_mapping_again(mapped, base, tmp_path):
-    taken = run(base, tmp_path / "out", earlier=result_of(mapped), gravity="off")
-    assert taken.seconds["model"] == mapped[1].seconds["model"]
-    assert StepLog(tmp_path / "out").result("model", ModelResult).earlier is not None
-    assert not taken.world.evidence.up_found
+    assert before == {path: path.read_bytes() for path in mapped[0].rglob("*") if path.is_file()}
+    assert not place(base, mapped, tmp_path / "out", gravity="off").world.evidence.up_found
 
 
 def test_a_part_that_there_is_not_is_refused_with_those_that_there_are(mapped, base, tmp_path):
     with pytest.raises(ConfigError) as refused:
-        run(base, tmp_path / "out", earlier=result_of(mapped), part=3)
+        place(base, mapped, tmp_path / "out", part=3)
     assert_facts(refused.value.message, "part is 3", f"1 of {LARGE}", f"2 of {SMALL}")
     assert "recon sfm --part 2" in refused.value.hint
 
 
-def test_a_run_that_was_killed_while_it_took_the_parts_takes_them_again(mapped, base, tmp_path):
+def test_a_run_that_was_killed_ends_with_the_bytes_of_one_that_was_not(
+    first, mapped, base, tmp_path
+):
     out = tmp_path / "out"
-    out.mkdir()
-    shutil.copytree(mapped[0] / "parts" / "1", out / "parts" / "1")  # no log yet
-    assert run(base, out, earlier=result_of(mapped), part=2).part == 2
-    assert placed(out) == PARTS[1]
-    (out / "undistorted" / "sparse" / "images.bin").unlink()  # and once it was placed
-    inode = (out / "sparse" / "images.bin").stat().st_ino
-    run(base, out, earlier=result_of(mapped), part=2)
-    assert (out / "undistorted" / "sparse" / "images.bin").exists()
-    assert (out / "sparse" / "images.bin").stat().st_ino == inode
-
-
-@pytest.mark.parametrize("lost", [
-    {"changed": frozenset({"parts/2/points3D.bin"})},
-    *(pytest.param(lost, marks=pytest.mark.slow) for lost in (
-        {"missing": frozenset({"parts/1/rigs.bin"})}, {"changed": frozenset({"steps.json"})}))])
-def test_parts_that_were_changed_are_not_taken(mapped, base, tmp_path, lost):
-    out = matched(tmp_path / "out")
-    run(base, out, earlier=result_of(mapped, **lost), part=2)  # maps by itself
-    assert StepLog(out).result("model", ModelResult).earlier is None
-    assert placed(out) == PARTS[1]
+    (out / "sparse").mkdir(parents=True)
+    (out / "sparse" / "images.bin").write_bytes(b"begun")
+    (out / "undistorted" / "images").mkdir(parents=True)
+    (out / "undistorted" / "images" / "000020.png").write_bytes(b"of another part")
+    place(base, mapped, out)
+    names = [path.relative_to(out) for path in sorted(out.rglob("*")) if path.is_file()]
+    assert names == [path.relative_to(first[0]) for path in sorted(first[0].rglob("*"))
+                     if path.is_file()]
+    assert not [name for name in names if (out / name).read_bytes() != (
+        first[0] / name).read_bytes()]
 
 
 def test_parts_that_hold_too_few_frames_together_are_refused(base, tmp_path):
@@ -158,7 +140,7 @@ def test_parts_that_hold_too_few_frames_together_are_refused(base, tmp_path):
 
 
 def test_the_notices_name_each_part_and_how_to_take_another_one(mapped, base, tmp_path, caplog):
-    run(base, tmp_path / "out", earlier=result_of(mapped), part=2)
+    place(base, mapped, tmp_path / "out", part=2)
     for facts in (("2 parts", "part 2 is used"), ("recon sfm --part 1", "recon report"),
                   ("Part 1", f"{LARGE} of 22 frames", "000000.png to 000011.png (0.0 to 5.5 s)"),
                   ("Part 2", f"{SMALL} of 22 frames", "000012.png to 000021.png")):

@@ -29,7 +29,7 @@ from recon_cli.stages import sfm
 from recon_cli.context import StageContext, StageInputs
 base = Path(sys.argv[1])
 sfm.run(SfmConfig(max_features={FEATURES}, segments="2"),
-        StageInputs({{"ingest": base / "ingest", "denoise": base / "denoise"}}), Path(sys.argv[2]),
+        StageInputs({{"ingest": base / "ingest"}}), Path(sys.argv[2]),
         StageContext(threads=2))
 """
 

@@ -80,9 +80,9 @@ def make_inputs(
         model.add_camera_with_trivial_rig(pycolmap.Camera(
             model="PINHOLE", width=shape.width, height=shape.height, camera_id=i + 1,
             params=[inner.fx, inner.fy, inner.cx, inner.cy]))
-    images = folder / "sfm" / "undistorted" / "images"
-    denoised = folder / "sfm" / "undistorted" / "denoised"
-    sparse = folder / "sfm" / "undistorted" / "sparse"
+    images = folder / "place" / "undistorted" / "images"
+    denoised = folder / "place" / "undistorted" / "denoised"
+    sparse = folder / "place" / "undistorted" / "sparse"
     for path in (images, denoised, sparse, folder / "ingest"):
         path.mkdir(parents=True)
     frames = []
@@ -107,12 +107,12 @@ def make_inputs(
         "source": "video", "frames": frames, "groups": [{
             "name": "tiny.mp4", "width": shape.width, "height": shape.height, "focal_px": None,
             "lens": None} for shape in shapes]})
-    return StageInputs({name: folder / name for name in ("ingest", "sfm")})
+    return StageInputs({name: folder / name for name in ("ingest", "place")})
 
 
 def write_masks(inputs: StageInputs, masks: dict[str, np.ndarray]) -> None:
     """Writes masks [H, W], True where a pixel counts, by the names of views."""
-    folder = inputs.folders["sfm"] / "undistorted" / "masks"
+    folder = inputs.folders["place"] / "undistorted" / "masks"
     folder.mkdir(exist_ok=True)
     for name, mask in masks.items():
         cv2.imwrite(str(folder / name), mask.astype(np.uint8) * 255)

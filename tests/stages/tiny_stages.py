@@ -64,7 +64,7 @@ def holding_out(inputs, tmp_path, *, held_out):
 
 def mean_colour_psnr(inputs):
     """PSNR of painting a view in its own mean colour: what knowing nothing of its shape gives."""
-    image = read_image(inputs.folders["sfm"] / "undistorted" / "images" / "000006.png", 48, 36)
+    image = read_image(inputs.folders["place"] / "undistorted" / "images" / "000006.png", 48, 36)
     mean = np.broadcast_to(image.mean((0, 1)) / 255, image.shape).astype(np.float32)
     return psnr(mean, image)
 

@@ -298,7 +298,7 @@ def test_a_finished_scene_is_not_trained_further_in_blocks():
 
 def test_a_job_comes_back_from_its_file_and_its_place_takes_no_part_in_its_key(tmp_path):
     cell = Cell(np.random.default_rng(0).random((5, 3)), np.array([1, 0, 0, 1, 1], bool))
-    inputs = StageInputs({"sfm": tmp_path / "sfm"}, digests={"sfm": "abc"})
+    inputs = StageInputs({"place": tmp_path / "place"}, digests={"place": "abc"})
     job = BlockJob(tmp_path / "0", inputs, frozenset("ab"), frozenset("b"), cell,
                    TrainConfig(iterations=7))
     job.write()

@@ -18,7 +18,7 @@ from recon_cli.trust.surface import SurfaceShares
 from recon_cli.workspace.records import Frame
 
 TRUSTED = dataclasses.replace(
-    summaries.SFM, frames=100, registered=100, verdict={"trusted": True}, left_out=(), parts=())
+    summaries.PLACE, frames=100, registered=100, verdict={"trusted": True}, left_out=(), parts=())
 
 
 def metrics(*psnr_db, ssim=0.95, name="pruned"):

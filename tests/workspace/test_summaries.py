@@ -11,9 +11,9 @@ from recon_cli.workspace.summaries import (
     AttemptSummary,
     IngestSummary,
     LogRow,
+    PlaceSummary,
     PosesSummary,
     PruneSummary,
-    SfmSummary,
     TrainSummary,
     WorldSummary,
 )
@@ -22,7 +22,7 @@ ATTEMPT = AttemptSummary(
     name="relaxed", reason="few cameras", skipped="", registered=9, models=(9, 3), weak_link=None,
     reprojection_error_px=0.5, seconds=1.5, kept=True)
 MAPPED = replace(
-    summaries.SFM, attempts=(ATTEMPT,), apart=(("a.png", "b.png"),), rejected={"c.png": "wrong"},
+    summaries.PLACE, attempts=(ATTEMPT,), apart=(("a.png", "b.png"),), rejected={"c.png": "wrong"},
     poses=PosesSummary(use="refine", metric=True, moved_median=0.1))
 
 
@@ -35,7 +35,7 @@ def test_the_keys_are_the_fields_in_order_without_what_does_not_apply():
     assert list(summaries.INGEST.to_json()) == [
         "kind", "declared_frames", "decoded_frames", "lost_frames", "dropped_blurred", "skipped",
         "frames", "held_out", "groups", "width", "height"]
-    assert summaries.SFM.to_json()["poses"] is None
+    assert summaries.PLACE.to_json()["poses"] is None
     assert MAPPED.to_json()["poses"] == {"use": "refine", "metric": True, "moved_median": 0.1}
 
 
@@ -43,9 +43,9 @@ def test_a_record_of_another_version_is_refused_with_what_it_lacks():
     value = MAPPED.to_json()
     del value["world"]["evidence"]["up_found"]
     with pytest.raises(ManifestError, match=r"up_found.*another version"):
-        SfmSummary.from_json(value)
+        PlaceSummary.from_json(value)
     with pytest.raises(ManifestError, match="not a JSON object"):
-        SfmSummary.from_json({**value, "world": 3})
+        PlaceSummary.from_json({**value, "world": 3})
 
 
 def test_a_value_of_another_type_is_refused_with_its_name():

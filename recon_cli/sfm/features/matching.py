@@ -90,8 +90,8 @@ def first_model(job: MappingJob, group: CameraGroup) -> str:
     A fisheye's matches are as those of an ordinary lens without a focal length until its own is
     found: with a wrong one no motion explains them. Segments have one model from the start.
     """
-    late = "FISHEYE" in group.model and job.last != "model" and not job.segments
-    return CAMERA_MODEL if late or group.model == "auto" else group.model
+    later = "FISHEYE" in group.model and not job.is_segment and not job.segments
+    return CAMERA_MODEL if later or group.model == "auto" else group.model
 
 
 def _reader_options(

@@ -206,8 +206,7 @@ def _begin_with_fisheye(
     Segments are joined by their intrinsics, of which one may be found a fisheye and another not:
     they stay with the model that their database was made with.
     """
-    is_segment = job.last == "model"
-    if is_segment or not wide_lens.find_fisheyes(job):
+    if job.is_segment or not wide_lens.find_fisheyes(job):
         return ways
     if job.segments:
         if all(group.model == "auto" for group in job.groups):
@@ -268,9 +267,8 @@ def _map_bridged_again(job: MappingJob, report: Reporter) -> list[pycolmap.Recon
 
 def may_bridge(job: MappingJob) -> bool:
     """Returns whether learned features may be asked: of photos that are mapped as one."""
-    is_segment = job.last == "model"  # has the keypoints that the others have
-    return job.pairs == "auto" and not (
-        is_segment or job.segments or job.panoramas or skeleton.is_continuous(job))
+    return job.pairs == "auto" and not (  # a segment has the keypoints that the others have
+        job.is_segment or job.segments or job.panoramas or skeleton.is_continuous(job))
 
 
 def list_thin(model: pycolmap.Reconstruction) -> tuple[str, ...]:
@@ -441,8 +439,7 @@ def _publish_best(
     held = {name for part in delivered for name in mapper.list_registered(part.model)}
     apart = [tuple(sorted(set(names) - held)) for names in chosen.apart]
     return ModelResult(
-        parts=tuple(parts.describe_part(
-            part.model, part.verdict, held=held, rejected=part.rejected) for part in delivered),
+        parts=tuple(parts.list_part(part.model, part.rejected) for part in delivered),
         models=(len(chosen.registered), *chosen.models[1:]),
         apart=tuple(names for names in apart if len(names) >= MIN_FRAMES),
         broken=() if job.accept_weak else verdict.problems,

@@ -6,6 +6,7 @@ Native code can abort, hang or fill the memory; in a process of its own it does 
 from __future__ import annotations
 
 import logging
+import math
 import queue
 import re
 import signal
@@ -21,9 +22,21 @@ from recon_cli.errors import ExitCode, ReconError, SfmError, format_count
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
-from recon_cli.sfm.job import LOCK, LOG_FILE, POLL_SECONDS, Event, MappingJob, Phase, parse
+from recon_cli.sfm.job import (
+    LOCK,
+    LOG_FILE,
+    PLACED,
+    POLL_SECONDS,
+    Event,
+    MappingJob,
+    Phase,
+    PlaceJob,
+    parse,
+)
+from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.disk import refuse_full_disk
 from recon_cli.workspace.journal import make_way
+from recon_cli.workspace.summaries import PlacedPart
 
 _DOING = {
     "features": ("finding features", "frame"),
@@ -52,7 +65,7 @@ class Monitor:
     """
 
     def __init__(
-        self, job: MappingJob, progress: Progress, record: Callable[[int, int], None],
+        self, job: MappingJob | PlaceJob, progress: Progress, record: Callable[[int, int], None],
         on_idle: Callable[[], None],
     ) -> None:
         self._job, self._progress, self._record = job, progress, record
@@ -139,11 +152,26 @@ def run_job(
              Monitor(job, progress, record, on_idle))
 
 
-def _run(job: MappingJob, max_minutes: float, monitor: Monitor) -> None:
+def place_part(
+    job: PlaceJob, *, progress: Progress, record: Callable[[int, int], None]
+) -> PlacedPart:
+    """Places a part in a process of its own and returns what is known of it; raises as `run_job`.
+
+    ConfigError if a place of --scale-between is unknown; SfmError if what tells the scale
+    contradicts itself.
+    """
+    _run(job, math.inf, Monitor(job, progress, record, lambda: None))
+    path = job.out / PLACED
+    placed = PlacedPart.from_json(read_json(path, dict))
+    path.unlink()
+    return placed
+
+
+def _run(job: MappingJob | PlaceJob, max_minutes: float, monitor: Monitor) -> None:
     """Runs a job for so many minutes at most; raises as `run_job`."""
     deadline = time.monotonic() + 60 * max_minutes
     file = job.out / "job.json"
-    job.write(file)
+    write_json(file, job.to_json())
     for kept in (job.out / LOG, job.out / LOCK):
         make_way(kept)
     try:
@@ -166,9 +194,9 @@ def _run(job: MappingJob, max_minutes: float, monitor: Monitor) -> None:
                 refuse_full_disk(job.out)
                 raise _crash_error(job.out / LOG, code, monitor)
     except BaseException:
-        if monitor.doing != "starting":  # what was found before has been checked
+        if isinstance(job, MappingJob) and monitor.doing != "starting":
             with suppress(OSError):  # the error that led here says more
-                database.seal(job.database)
+                database.seal(job.database)  # what was found before has been checked
         raise
     finally:
         for leftover in (file, job.out / LOCK):
@@ -176,15 +204,15 @@ def _run(job: MappingJob, max_minutes: float, monitor: Monitor) -> None:
 
 
 @contextmanager
-def _start(job: MappingJob, file: Path) -> Iterator[subprocess.Popen[bytes]]:
+def _start(job: MappingJob | PlaceJob, file: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Yields the running process and kills it on leaving, however that happens.
 
     What several threads share is shared out in here: sums that BLAS or OpenMP split among threads
     differ with their number.
     """
     with (job.out / LOG).open("ab") as log, start_module(
-        "recon_cli.sfm.mapping.worker", str(file), folder=job.out, out=subprocess.PIPE, errors=log,
-        OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1",
+        "recon_cli.sfm.mapping.worker", type(job).__name__, str(file), folder=job.out,
+        out=subprocess.PIPE, errors=log, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1",
     ) as child:
         try:
             yield child

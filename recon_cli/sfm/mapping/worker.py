@@ -1,4 +1,4 @@
-"""The mapping process: `python -m recon_cli.sfm.mapping.worker JOB`, started by `process` alone.
+"""The mapping process: `python -m recon_cli.sfm.mapping.worker KIND JOB`, which `process` starts.
 
 It reports on its standard output (see `job`), logs to its standard error, and does not outlive its
 parent: the end of its standard input ends it at once.
@@ -27,9 +27,8 @@ from recon_cli.sfm.job import (
     LOCK,
     LOG_FILE,
     SPLIT,
-    STEPS,
-    VERDICT,
     MappingJob,
+    PlaceJob,
     Reporter,
     StepLog,
 )
@@ -39,14 +38,10 @@ from recon_cli.sfm.results import RESULTS, CountedResult, StepResult
 from recon_cli.sfm.segments import join_segments
 from recon_cli.sfm.views import undistort
 from recon_cli.signals import leave_to_parent
+from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.disk import find_space_errno
-from recon_cli.workspace.summaries import WorldSummary
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
-
-# The folders that steps write, and files besides.
-_FOLDERS = {"model": "parts", "sparse": "sparse", "undistorted": "undistorted"}
-_BESIDES = {"model": (join_segments.REPORT,), "sparse": (WorldSummary.FILE, VERDICT)}
 
 
 def work(job: MappingJob, report: Reporter) -> None:
@@ -59,12 +54,10 @@ def work(job: MappingJob, report: Reporter) -> None:
         SPLIT: lambda: join_segments.split_by_view_graph(job),
         "model": lambda: (
             known_poses.build_known_model if job.known_poses else fallbacks.build_model)(
-                job, report),
-        "sparse": lambda: undistort.place_model(job),
-        "undistorted": lambda: undistort.undistort(job, report)}
+                job, report)}
     log = StepLog(job.out)
     rematch = _forget_damaged(job, log, report)
-    mapped = job.last == STEPS[-1] and log.is_finished("model")
+    mapped = not job.is_segment and log.is_finished("model")
     if "features" in job.steps and not mapped:  # else nothing reads it any more
         _prepare_database(job, log, report, rematch=rematch)
     for step in job.steps:
@@ -79,8 +72,9 @@ def work(job: MappingJob, report: Reporter) -> None:
                          cpu_seconds=round(time.process_time() - cpu, 2))
         if step in ("features", "matches"):
             database.seal(job.database)
-        folder = job.out / _FOLDERS[step] if step in _FOLDERS else None
-        log.finish(step, result, folder, _BESIDES.get(step, ()))
+        is_model = step == "model"
+        log.finish(step, result, job.parts if is_model else None,
+                   (join_segments.REPORT,) if is_model else ())
 
 
 def _forget_damaged(job: MappingJob, log: StepLog, report: Reporter) -> bool:
@@ -129,16 +123,21 @@ def _take_stdout() -> BinaryIO:
 
 
 def main() -> None:
-    """Runs the job named on the command line and reports errors to the parent."""
+    """Runs the job of the kind and file on the command line; reports errors to the parent."""
     report = Reporter(_take_stdout())
     leave_to_parent()
     faulthandler.enable()
     end_with_parent()
-    job = MappingJob.read(Path(sys.argv[1]))
+    kind, file = sys.argv[1:]
+    job = (PlaceJob if kind == PlaceJob.__name__ else MappingJob).from_json(
+        read_json(Path(file), dict))
     cv2.setNumThreads(1)  # images are shared out among the threads of the job
     try:
         with filelock.FileLock(job.out / LOCK, timeout=LOCK_SECONDS):
-            work(job, report)
+            if isinstance(job, PlaceJob):
+                undistort.place(job, report)
+            else:
+                work(job, report)
     except filelock.Timeout:
         report.fail(WorkspaceError(
             f"Another process is still working in {job.out}.", hint="End it, then run this again."))

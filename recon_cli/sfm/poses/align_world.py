@@ -7,8 +7,9 @@ its evidence. The user gives a scale by --scale-between: a known distance betwee
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from recon_cli.room.scale import (
     Measurement,
     ScaleBetween,
     measure,
+    parse_place,
 )
 from recon_cli.room.scale_fusion import (
     GIVEN,
@@ -36,6 +38,7 @@ from recon_cli.room.scale_fusion import (
 )
 from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
+from recon_cli.workspace.records import find_frames
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
 
 
@@ -54,6 +57,21 @@ class WorldFrame:
             similarity=self.similarity.to_json(), evidence=self.evidence,
             measurement=self.measurement.to_json() if self.measurement else None,
             sentences=self.sentences)
+
+
+def find_places(
+    ingest: Path, scale_between: tuple[str, str, float] | None, names: Collection[str]
+) -> tuple[str, str, float] | None:
+    """Returns the two places of --scale-between by the names of frames, and their distance.
+
+    ConfigError if a place is unknown.
+    """
+    if scale_between is None:
+        return None
+    first, second = find_frames(ingest, scale_between[:2])
+    for place in (first, second):
+        parse_place(place, names)
+    return first, second, scale_between[2]
 
 
 def world_transform(

@@ -201,7 +201,7 @@ def _write(
     parts.write_parts(job, [(model, verdict)])
     shutil.rmtree(job.attempts, ignore_errors=True)
     return ModelResult(
-        parts=(parts.describe_part(model, verdict),), notes=tuple(notes),
+        parts=(parts.list_part(model),), notes=tuple(notes),
         models=(model.num_reg_images(),), poses=poses)
 
 

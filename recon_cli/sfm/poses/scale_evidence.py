@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.depth_maps import MOST_NOISE, lens_camera, read_depth_list, read_sure_depth
 from recon_cli.room.scale_fusion import ScaleSource
-from recon_cli.sfm.job import MappingJob, StepLog
-from recon_cli.sfm.results import ModelResult
+from recon_cli.sfm.job import PlaceJob
 from recon_cli.workspace.records import read_poses
 
 Viewmats = Mapping[str, NDArray[np.float64]]  # [4, 4] world to camera by name
@@ -59,17 +58,15 @@ class DeviceEvidence:
 
 
 def ask_device(
-    job: MappingJob, model: pycolmap.Reconstruction, viewmats: Viewmats
+    job: PlaceJob, model: pycolmap.Reconstruction, viewmats: Viewmats
 ) -> DeviceEvidence:
     """Returns what the poses and the depth of a job say about its model of these cameras.
 
     Poses that were solved or rendered are what they say; those that were tracked are measured.
     """
-    if not job.known_poses or job.poses is None:
+    if job.poses is None:
         return DeviceEvidence()
-    known = read_poses(job.poses)
-    result = StepLog(job.out).result("model", ModelResult)
-    refuted = result is not None and result.poses is not None and result.poses.use == "refuted"
+    known, refuted = read_poses(job.poses), job.pose_use == "refuted"
     if known.accuracy != "tracked" and not refuted:
         return DeviceEvidence(known.metric, known.find_up or known.up is not None, known.up)
     sources = []

@@ -156,7 +156,7 @@ def _segment_job(job: MappingJob, index: int, threads: int) -> MappingJob:
               for group in job.groups]
     segment = dataclasses.replace(
         job, out=folder, groups=tuple(group for group in groups if group.names), threads=threads,
-        segments=(), split=0, last="model")
+        segments=(), split=0, is_segment=True)
     listed = folder / "frames.txt"
     text = "".join(f"{name}\n" for name in names)
     if not job.split and not (listed.is_file() and listed.read_bytes() == text.encode()):

@@ -25,14 +25,13 @@ from recon_cli.io.images import read_png, write_png
 from recon_cli.io.training_scene import held_out_names
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.scene.faces import is_cube_face, view_name
-from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
-from recon_cli.sfm.mapping.parts import check_part
+from recon_cli.sfm.job import PLACED, VERDICT, PlaceJob, Reporter, fresh_folder
+from recon_cli.sfm.mapping.mapper import triangulation_angles
 from recon_cli.sfm.poses.align_world import refuse_contradiction, world_transform
 from recon_cli.sfm.poses.depth_points import add_depth_points
 from recon_cli.sfm.poses.scale_evidence import ask_device
-from recon_cli.sfm.results import PlacedResult, UndistortedResult
 from recon_cli.sfm.segments.shared_points import to_sim3d
-from recon_cli.sfm.verdict.scale_drift import ScaleCut
+from recon_cli.sfm.verdict.verdict import ModelVerdict
 from recon_cli.sfm.views.flat_views import (
     MOST_LOST,
     FlatView,
@@ -43,21 +42,43 @@ from recon_cli.sfm.views.flat_views import (
 )
 from recon_cli.sfm.views.undistort_faces import write_views
 from recon_cli.workspace import atomic
-from recon_cli.workspace.summaries import WorldSummary
+from recon_cli.workspace.summaries import PlacedPart, WorldSummary
 
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
 
 
-def place_model(job: MappingJob) -> PlacedResult:
-    """Writes the model of the job's part, moved into the world frame, into out/sparse.
+def place(job: PlaceJob, report: Reporter) -> None:
+    """Writes the views of the job's part in the world frame, and what is known of them."""
+    part = job.models / str(job.part)
+    model, verdict = pycolmap.Reconstruction(part), None
+    tracks = model.compute_num_observations() > 0
+    if (part / VERDICT).exists():
+        verdict = ModelVerdict.from_json(atomic.read_json(part / VERDICT, dict))
+        # a frame that another part holds is not said to have no camera
+        held = {name for names in job.parts for name in names}
+        unregistered = {name: why for name, why in verdict.unregistered.items() if name not in held}
+        lines = tuple(dataclasses.replace(verdict, unregistered=unregistered).lines())
+        atomic.write_json(job.out / VERDICT, verdict.to_json())
+    placed = PlacedPart(
+        points=model.num_points3D(),
+        mean_track_length=model.compute_mean_track_length() if tracks else None,
+        reprojection_error_px=model.compute_mean_reprojection_error() if tracks else None,
+        median_triangulation_angle_deg=(
+            float(np.median(triangulation_angles(model))) if tracks else None),
+        verdict=verdict.to_json() if verdict else None, lines=lines if verdict else (),
+        world=place_model(job, model, verdict), cameras=undistort(job, report))
+    atomic.write_json(job.out / PLACED, placed.to_json())
+
+
+def place_model(
+    job: PlaceJob, model: pycolmap.Reconstruction, verdict: ModelVerdict | None
+) -> WorldSummary:
+    """Writes a model, which it moves into the world frame, into out/sparse.
 
     The axes of a data set with poses are left as they are, unless it knows up, or says that they
-    are arbitrary. ConfigError if the part, or a place of --scale-between, is unknown; SfmError if
-    what tells the scale contradicts itself, unless that is accepted.
+    are arbitrary. ConfigError if a place of --scale-between is unknown; SfmError if what tells the
+    scale contradicts itself, unless that is accepted.
     """
-    check_part(job)
-    part = job.parts / str(job.part)
-    model = pycolmap.Reconstruction(part)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     viewmats = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
                 for name, image in images.items()}
@@ -77,19 +98,14 @@ def place_model(job: MappingJob) -> PlacedResult:
     refuse_contradiction(world.evidence, accepted=job.accept_weak)
     if device.remark:
         world = dataclasses.replace(world, sentences=(*world.sentences, device.remark))
-    verdict = atomic.read_json(part / VERDICT) if (part / VERDICT).exists() else {}
-    if verdict.get("scale"):
+    if verdict and verdict.scale:
         world = dataclasses.replace(world, evidence=dataclasses.replace(
-            world.evidence, scale_spread=ScaleCut.from_json(verdict["scale"]).spread))
+            world.evidence, scale_spread=verdict.scale.spread))
     model.transform(to_sim3d(world.similarity))
-    folder = fresh_folder(job.out / "sparse.partial")
-    write_model(model, folder)
-    publish(folder, job.out / "sparse")
+    write_model(model, fresh_folder(job.out / SPARSE))
     summary = world.summary()
     atomic.write_json(job.out / WorldSummary.FILE, summary.to_json())
-    if verdict:
-        atomic.write_json(job.out / VERDICT, verdict)
-    return PlacedResult(world=summary)
+    return summary
 
 
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:
@@ -98,21 +114,20 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
     return Pinhole(flat.width, flat.height, *flat.params)
 
 
-def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
+def undistort(job: PlaceJob, report: Reporter) -> tuple[Mapping[str, float], ...]:
     """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
     model = pycolmap.Reconstruction(job.out / SPARSE)
     images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     names = sorted(images)
     report.phase("undistorted", len(names))
-    work = fresh_folder(job.out / "undistorted.partial")
+    work = fresh_folder(job.out / "undistorted")
     views = {number: find_views(camera, partial(_counting, job, [
         name for name in names if images[name].camera_id == number]))
         for number, camera in model.cameras.items()}
     if any(each[0].face is not None for each in views.values()):
         _tell_faces(views, report)
-        sizes = write_views(job, model, work, report, views, (IMAGES, TWINS, MASKS, SPARSE))
-        publish(work, job.out / "undistorted")
-        return UndistortedResult(cameras=tuple(sizes))
+        return tuple(
+            write_views(job, model, work, report, views, (IMAGES, TWINS, MASKS, SPARSE)))
     flat = _write_model(job, model, names[0], work)
     warps = {number: places_in(camera, flat.cameras[number])
              for number, camera in model.cameras.items()}
@@ -135,15 +150,13 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
         for count, _ in enumerate(pool.map(write, names), 1):
             report.done(count)
     counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
-    cameras = tuple(
+    return tuple(
         {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
          "frames": counts[index]}
         for index, camera in sorted(flat.cameras.items()))
-    publish(work, job.out / "undistorted")
-    return UndistortedResult(cameras=cameras)
 
 
-def _counting(job: MappingJob, names: Sequence[str]) -> NDArray[np.bool_] | None:  # [H, W]
+def _counting(job: PlaceJob, names: Sequence[str]) -> NDArray[np.bool_] | None:  # [H, W]
     """Returns the pixels that some mask of frames of one size leaves; None for all."""
     if job.masks is None or not all((job.masks / name).exists() for name in names):
         return None
@@ -152,7 +165,7 @@ def _counting(job: MappingJob, names: Sequence[str]) -> NDArray[np.bool_] | None
 
 
 def _write_model(
-    job: MappingJob, model: pycolmap.Reconstruction, name: str, work: Path
+    job: PlaceJob, model: pycolmap.Reconstruction, name: str, work: Path
 ) -> pycolmap.Reconstruction:
     """Writes the undistorted `model` into work/sparse and returns it.
 

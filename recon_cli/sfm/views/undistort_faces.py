@@ -22,16 +22,16 @@ from recon_cli.io.face_frames import write_face_frames
 from recon_cli.io.images import read_png, write_png
 from recon_cli.scene.faces import nearest_face, view_name
 from recon_cli.sfm.features.sphere import unit_rays
-from recon_cli.sfm.job import MappingJob, Reporter
+from recon_cli.sfm.job import PlaceJob, Reporter
 from recon_cli.sfm.views.flat_views import FlatView
 
 
 def write_views(
-    job: MappingJob, model: pycolmap.Reconstruction, work: Path, report: Reporter,
+    job: PlaceJob, model: pycolmap.Reconstruction, work: Path, report: Reporter,
     views: Mapping[int, Sequence[FlatView]],  # by camera
     folders: Sequence[str],  # of images, their denoised twins, masks and the model
 ) -> list[dict[str, float]]:
-    """Writes the views of a model into `work` and returns their cameras, as `UndistortedResult`."""
+    """Writes the views of a model into `work` and returns their cameras, as `PlacedPart`."""
     images, twins, masks, sparse = folders
     number_cameras(views)
     frames = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}

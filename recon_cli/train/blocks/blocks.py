@@ -157,7 +157,7 @@ class BlockJob:
         part = self.folder / "sparse"
         shutil.rmtree(part, ignore_errors=True)
         write_part(
-            self.inputs.folders["sfm"] / "undistorted" / "sparse", part, self.views,
+            self.inputs.folders["place"] / "undistorted" / "sparse", part, self.views,
             context_points(self.cell.owned, self.config.seed))
         scene = load_scene(self.inputs.folders, validation=self.validation, sparse=part)
         scene = with_masks(scene, self.folder.parent.parent)  # those that a user has edited
@@ -170,7 +170,7 @@ def cut_blocks(
     """Writes and returns the jobs of the blocks of a scene; the same scene gives the same ones."""
     views = {view.name: view for view in (*scene.train, *scene.validation, *scene.test)}
     names, points, observations = read_observations(
-        inputs.folders["sfm"] / "undistorted" / "sparse")
+        inputs.folders["place"] / "undistorted" / "sparse")
     if not len(observations.view):  # points that came with the poses
         observations = observe_points(points, [views[name].camera for name in names])
     labels = split_views(observations, count)
