@@ -18,7 +18,7 @@ from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.face_frames import read_face_frames
-from recon_cli.scene.camera import Camera, Lens
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
 from recon_cli.workspace.paths import refuse_special
@@ -293,13 +293,6 @@ def _prior(
     if up is not None:
         prior.gravity = camera.viewmat[:3, :3] @ -up
     return prior
-
-
-def project(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the pixels [M, 2] of points [M, 3] in a camera's axes, all before it."""
-    camera = pycolmap.Camera(
-        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
-    return np.asarray(camera.img_from_cam(points))
 
 
 def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:

@@ -170,11 +170,8 @@ def _views(
 
 def _distance(means: NDArray[np.float64], camera: Camera) -> float:
     """Returns the median depth of the centres that a camera sees; 0 if it sees none."""
-    x, y, z = camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    visible = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return float(np.median(z[visible])) if visible.any() else 0.0
+    *_, depths = camera.find_visible(means)
+    return float(np.median(depths)) if len(depths) else 0.0
 
 
 @cache

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.io.depth_maps import MOST_NOISE, lens_camera, read_depth_list, read_sure_depth
+from recon_cli.io.depth_maps import (
+    MOST_NOISE,
+    find_visible,
+    lens_camera,
+    read_depth_list,
+    read_sure_depth,
+)
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.sfm.job import MappingJob, StepLog
 from recon_cli.sfm.results import ModelResult
@@ -194,15 +200,12 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
         if not len(pixels):
             continue
         rays = np.asarray(images[name].camera.cam_from_img(pixels))
-        at = np.asarray(lens_camera(one.lens).img_from_cam(
-            np.column_stack([rays, np.ones(len(rays))])))
-        at = np.nan_to_num(at, nan=-1.0)
-        inside = ((at >= 0) & (at < (one.lens.width, one.lens.height))).all(axis=1)
-        column, row = at[inside].astype(np.intp).T
-        theirs = depth[row, column].astype(np.float64)
+        rows, column, line = find_visible(
+            lens_camera(one.lens), np.column_stack([rays, np.ones(len(rays))]))
+        theirs = depth[line, column].astype(np.float64)
         known = theirs > 0
         if known.sum() >= FEWEST_DEPTHS:
-            every.append(theirs[known] / ours[inside][known])
+            every.append(theirs[known] / ours[rows][known])
             ratios.append(float(np.median(every[-1])))
     if len(ratios) < FEWEST_BLOCKS:
         return None
