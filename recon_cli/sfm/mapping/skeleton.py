@@ -42,6 +42,7 @@ from recon_cli.sfm.features.pair_checks import check_pairs, list_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, is_vouched, publish, vouch
 from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, MIN_PAIR_INLIERS
 from recon_cli.sfm.mapping import mapper, merge_models
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.segments.loop_closure import bend_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
 
@@ -340,7 +341,7 @@ def _most(models: Sequence[pycolmap.Reconstruction]) -> int:
 
 def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Returns the cameras of a skeleton with the points that the matches give, adjusted."""
-    poses = {image.name: image.cam_from_world() for image in _images(skeleton)}
+    poses = {image.name: image.cam_from_world() for image in registered_images(skeleton)}
     model = mapper.triangulate(
         job, merge_models.build_posed_model(job.database, skeleton, poses), rounds=1)
     mapper.refine(job, model)
@@ -433,7 +434,3 @@ def _append_tracks(
         write = opened.update_keypoints if there else opened.write_keypoints
         write(image.image_id, np.concatenate([keypoints, followed]))
     return counts
-
-
-def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    return [model.image(number) for number in model.reg_image_ids()]

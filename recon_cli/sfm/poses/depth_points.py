@@ -22,6 +22,7 @@ from recon_cli.io.depth_maps import (
     read_sure_depth,
 )
 from recon_cli.io.images import read_png
+from recon_cli.sfm.model_arrays import registered_images
 
 MOST_MAPS = 100  # evenly spread
 SAMPLES = 8000  # of each map
@@ -43,7 +44,7 @@ def add_depth_points(
     FormatError if a map or frame is damaged.
     """
     maps = {name: one for name, one in read_depth_list(ingest).items() if name not in without}
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    images = {image.name: image for image in registered_images(model)}
     names = sorted(set(maps) & set(images))
     count = min(len(names), MOST_MAPS)
     clouds = [

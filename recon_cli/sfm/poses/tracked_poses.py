@@ -35,6 +35,7 @@ from recon_cli.sfm.mapping.prior_adjustment import (
     make_points,
     measure_deviation,
 )
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.segments.loop_closure import bend_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
 from recon_cli.sfm.verdict.evidence import explained_matches
@@ -230,7 +231,7 @@ def _place(model: pycolmap.Reconstruction, viewmats: Viewmats) -> None:
 
 def _points(model: pycolmap.Reconstruction) -> dict[str, int]:
     """Returns how many points each camera of a model sees."""
-    images = [model.image(number) for number in model.reg_image_ids()]
+    images = registered_images(model)
     return {image.name: image.num_points3D for image in images}
 
 

@@ -28,6 +28,7 @@ from recon_cli.sfm.features.pair_checks import check_pairs, list_views
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import MAX_TENSION
 from recon_cli.sfm.mapping import mapper, merge_models, skeleton
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import MatchesResult, SplitResult
 from recon_cli.sfm.segments.loop_closure import Node, bend_segments, move_frames
 from recon_cli.sfm.segments.segment_joins import (
@@ -330,8 +331,7 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
 
 
 def _images(model: pycolmap.Reconstruction, names: frozenset[str]) -> list[pycolmap.Image]:
-    images = (model.image(number) for number in model.reg_image_ids())
-    return [image for image in images if image.name in names]
+    return [image for image in registered_images(model) if image.name in names]
 
 
 def _posed(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.sfm.model_arrays import ModelArrays
 
 # Frames; whatever shows a point again after more than so many has come back to it.
 RUN = 20
@@ -50,8 +51,8 @@ class _Observations:
 
 def measure_stiffness(model: pycolmap.Reconstruction, names: Sequence[str]) -> Stiffness:
     """Returns how stiff a model is between its frames, whose names are given in order."""
-    images = [model.find_image_with_name(name) for name in names]
-    seen = _observe(model, images)
+    arrays = ModelArrays.from_model(model, names)
+    images, seen = arrays.images, _observe(arrays)
     error = max(model.compute_mean_reprojection_error(), LEAST_ERROR)
     noise = error / images[0].camera.mean_focal_length()
     run = np.cumsum(seen.starts) - 1
@@ -74,23 +75,14 @@ def measure_stiffness(model: pycolmap.Reconstruction, names: Sequence[str]) -> S
         np.column_stack([seen.frame[loops - 1], seen.frame[loops]]), seen.point[loops])
 
 
-def _observe(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> _Observations:
-    numbers = np.array(sorted(model.points3D), np.int64)
-    places = np.array([model.point3D(number).xyz for number in numbers.tolist()]).reshape(-1, 3)
-    centers = np.array([image.projection_center() for image in images])
-    seen = [np.unique(np.array(
-        [point.point3D_id for point in image.points2D if point.has_point3D()], np.int64))
-        for image in images]
-    frame = np.repeat(np.arange(len(images)), [len(each) for each in seen])
-    point = np.searchsorted(numbers, np.concatenate([np.zeros(0, np.int64), *seen]))
-    order = np.lexsort((frame, point))
-    frame, point = frame[order], point[order]
-    rays = centers[frame] - places[point]
+def _observe(arrays: ModelArrays) -> _Observations:
+    point, frame = np.unique(np.column_stack([arrays.point, arrays.image]), axis=0).T
+    rays = arrays.centers[frame] - arrays.points[point]
     depth = np.linalg.norm(rays, axis=1)
     new = np.append(True, point[1:] != point[:-1])[:len(point)]
     returns = ~new & (np.diff(frame, prepend=0) > RUN)
     return _Observations(
-        frame, places[point], rays / depth[:, None], depth, new | returns, returns)
+        frame, arrays.points[point], rays / depth[:, None], depth, new | returns, returns)
 
 
 def _opening(
