@@ -21,6 +21,11 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [model.image(number) for number in model.reg_image_ids()]
 
 
+def viewmat_of(image: pycolmap.Image) -> NDArray[np.float64]:
+    """Returns the pose of an image, world to camera, [4, 4]."""
+    return np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+
+
 @dataclass(frozen=True, eq=False)
 class ModelArrays:
     """F images with a camera, P points, and O observations, image by image."""
@@ -64,10 +69,7 @@ class ModelArrays:
     @cached_property
     def viewmats(self) -> NDArray[np.float64]:
         """World to camera, [F, 4, 4]."""
-        viewmats = np.tile(np.eye(4), (len(self.images), 1, 1))
-        for viewmat, image in zip(viewmats, self.images, strict=True):
-            viewmat[:3] = image.cam_from_world().matrix()
-        return viewmats
+        return np.array([viewmat_of(image) for image in self.images]).reshape(-1, 4, 4)
 
     def observed(self, row: int) -> slice:
         """Returns where the observations of an image stand."""

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import UP, turn_from
 from recon_cli.splats.format import LoadedScene, SplatFormat, Tour, WriteSettings
@@ -99,12 +99,7 @@ def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
     back = np.array([0.0, -1, 0]) if abs(up[1]) < 0.5 else np.array([0.0, 0, np.sign(up[1])])
     back -= (back @ up) * up
     offset = 2.5 * back / np.linalg.norm(back) + 0.5 * up
-    forward = -offset / np.linalg.norm(offset)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (middle + reach * offset)
+    viewmat = looking_at(middle + reach * offset, middle, up)
     width, height, focal = _DEFAULT_LENS
     return "", Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm.features.matching import Pair
+from recon_cli.sfm.features.matching import Pair, read_matched_pixels
 from recon_cli.sfm.limits import (
     MAX_DRIFT,
     MAX_DRIFT_DEG,
@@ -45,17 +45,11 @@ def check_pairs(
 ) -> PairChecks:
     """Returns which verified pairs of a database agree with the cameras of views, by name."""
     agreeing, drifted, contradicting, unplaced = set(), set(), set(), set()
-    with pycolmap.Database.open(path) as opened:
-        keypoints = {
-            image.name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
-            for image in opened.read_all_images()}
-    for pair, geometry in geometries.items():
+    for pair, ours, theirs in read_matched_pixels(path, geometries):
         first, second = (views.get(name) for name in pair)
         if first is None or second is None or first.group != second.group:
             unplaced.add(pair)
             continue
-        ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
-                        for side, name in enumerate(pair))
         explained = explained_matches(
             first.image, ours, second.image, theirs, first.near, MAX_ERROR_PX)
         if explained.mean() >= MIN_PAIR_EXPLAINED:

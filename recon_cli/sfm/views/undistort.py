@@ -27,7 +27,7 @@ from recon_cli.scene.camera import Lens
 from recon_cli.scene.faces import is_cube_face, view_name
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.mapping.parts import check_part
-from recon_cli.sfm.model_arrays import registered_images
+from recon_cli.sfm.model_arrays import registered_images, viewmat_of
 from recon_cli.sfm.poses.align_world import refuse_contradiction, world_transform
 from recon_cli.sfm.poses.depth_points import add_depth_points
 from recon_cli.sfm.poses.scale_evidence import ask_device
@@ -60,8 +60,7 @@ def place_model(job: MappingJob) -> PlacedResult:
     part = job.parts / str(job.part)
     model = pycolmap.Reconstruction(part)
     images = {image.name: image for image in registered_images(model)}
-    viewmats = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-                for name, image in images.items()}
+    viewmats = {name: viewmat_of(image) for name, image in images.items()}
     device = ask_device(job, model, viewmats)
     if device.depth_scale is not None and job.pose_use != "keep" and job.poses is not None:
         ingest = job.poses.parent

@@ -1,4 +1,4 @@
-"""How well each frame of a walk is tied to the next: where a model may have drifted.
+"""What a model knows of each frame of a walk against the next: where it may have drifted.
 
 Scale passes from one stretch of a walk to the next by points that both have triangulated by
 themselves. Where a camera turns on the spot or in a narrow place there are few, or their rays
@@ -27,7 +27,7 @@ TURN_PIXELS = 3.0  # by which the place of a point is off from one frame to the 
 
 
 @dataclass(frozen=True, eq=False)
-class Stiffness:
+class EdgeInformation:
     """Standard deviations of what each of F frames in a row has against the next, [F - 1]."""
 
     scale: NDArray[np.float64]  # of the logarithm of their relative scale
@@ -49,8 +49,8 @@ class _Observations:
     returns: NDArray[np.bool_]  # [O], whether it is the first after a gap of more than RUN frames
 
 
-def measure_stiffness(model: pycolmap.Reconstruction, names: Sequence[str]) -> Stiffness:
-    """Returns how stiff a model is between its frames, whose names are given in order."""
+def measure_information(model: pycolmap.Reconstruction, names: Sequence[str]) -> EdgeInformation:
+    """Returns what a model knows of its frames, whose names are given in order."""
     arrays = ModelArrays.from_model(model, names)
     images, seen = arrays.images, _observe(arrays)
     error = max(model.compute_mean_reprojection_error(), LEAST_ERROR)
@@ -69,7 +69,7 @@ def measure_stiffness(model: pycolmap.Reconstruction, names: Sequence[str]) -> S
     turn = np.clip(INFLATION * TURN_PIXELS * noise / np.sqrt(count), *TURNS)
     usual = _usual_depths(seen, len(images))
     loops = np.flatnonzero(seen.returns)
-    return Stiffness(
+    return EdgeInformation(
         np.clip(INFLATION / np.sqrt(scale), *SCALES), turn,
         turn * np.minimum(usual[1:], usual[:-1]),
         np.column_stack([seen.frame[loops - 1], seen.frame[loops]]), seen.point[loops])
