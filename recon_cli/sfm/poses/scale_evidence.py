@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.depth_maps import MOST_NOISE, lens_camera, read_depth_list, read_sure_depth
 from recon_cli.room.scale_fusion import ScaleSource
-from recon_cli.sfm.job import MappingJob, StepLog
+from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.results import ModelResult
 from recon_cli.workspace.records import read_poses
+from recon_cli.workspace.steps import StepFolder
 
 Viewmats = Mapping[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 
@@ -68,7 +69,7 @@ def ask_device(
     if not job.known_poses or job.poses is None:
         return DeviceEvidence()
     known = read_poses(job.poses)
-    result = StepLog(job.out).result("model", ModelResult)
+    result = StepFolder(job.out).find("model", ModelResult)
     refuted = result is not None and result.poses is not None and result.poses.use == "refuted"
     if known.accuracy != "tracked" and not refuted:
         return DeviceEvidence(known.metric, known.find_up or known.up is not None, known.up)
