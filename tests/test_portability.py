@@ -188,7 +188,7 @@ def test_a_line_of_digests_keeps_its_bytes_where_files_are_text_unless_told(
     monkeypatch.setattr(os, "open", noting)
     steps.confirm(stage / "file")
     assert asked[-1] & binary
-    assert list(steps.StepFolder(stage, steps.log_path(stage)).read()) == ["file"]
+    steps.StepFolder(stage, steps.log_path(stage)).refuse_damaged_log()
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs /proc")

@@ -111,9 +111,9 @@ class StepFolder:
                             for each in map(finished.get, steps)])
 
     @property
-    def is_empty(self) -> bool:
-        """Whether no step was finished."""
-        return not self._finished()
+    def steps(self) -> list[str]:
+        """The names of all steps that were finished."""
+        return list(self._finished())
 
     def finish(
         self, step: str, result: JsonRecord | Mapping[str, Any] | None = None,
@@ -162,15 +162,24 @@ class StepFolder:
         finally:
             os.close(descriptor)
 
-    def read(self) -> dict[str, _History]:
-        """Returns the steps by name; ValueError for a damaged line, OSError without a log."""
+    def refuse_damaged_log(self) -> None:
+        """Raises ValueError where the log is missing, not a plain file, or has a damaged line."""
         if not is_plain_file(self._log):
-            raise ValueError("it is not a plain file")
+            raise ValueError(f"{self._log} is not a plain file")
+        for number, line in enumerate(self._lines(), start=1):
+            if not _is_whole(line):
+                raise ValueError(f"{self._log}, line {number}, is damaged")
+
+    def _lines(self) -> list[bytes]:
+        return self._log.read_bytes().split(b"\n")[:-1] if is_plain_file(self._log) else []
+
+    def _known(self) -> dict[str, _History]:
+        """Returns the steps by name; a damaged line voids all before it."""
         histories: dict[str, _History] = {}
-        for line in self._log.read_bytes().split(b"\n")[:-1]:
-            text, _, crc = line.rpartition(_CRC.encode())
-            if int(crc.rstrip(b"}")) != zlib.crc32(text):
-                raise ValueError("a line was changed")
+        for line in self._lines():
+            if not _is_whole(line):
+                histories.clear()
+                continue
             value = json.loads(line)
             history, state = histories.setdefault(value["step"], _History()), value.get("state")
             if state != "there":
@@ -179,13 +188,6 @@ class StepFolder:
                 history.states = [entry, *history.states[:1]] if state else [entry]
             history.pending = state == "begun"
         return histories
-
-    def _known(self) -> dict[str, _History]:
-        """Returns the steps by name; none in a new folder, or where the log is damaged."""
-        try:
-            return self.read()
-        except (OSError, ValueError):
-            return {}
 
     def _finished(self) -> dict[str, _Entry]:
         return {step: history.last for step, history in self._known().items()
@@ -218,6 +220,11 @@ class StepFolder:
             content = self._log.read_bytes()
             if not content.endswith(b"\n"):
                 os.truncate(self._log, content.rfind(b"\n") + 1)
+
+
+def _is_whole(line: bytes) -> bool:
+    text, _, crc = line.rpartition(_CRC.encode())
+    return crc == b"%d}" % zlib.crc32(text)
 
 
 def log_path(folder: Path) -> Path:
@@ -262,13 +269,14 @@ def find_damage(folder: Path) -> str:
 
     Files without a digest were not finished and are deleted.
     """
-    work, log = StepFolder(folder, log_path(folder)), log_path(folder)
+    work = StepFolder(folder, log_path(folder))
     try:
-        histories = work.read()
-    except (OSError, ValueError):
-        return f"{log.name} is missing or damaged"
+        work.refuse_damaged_log()
+    except ValueError:
+        return f"{log_path(folder).name} is missing or damaged"
+    known = work.steps
     for path in _files_below(folder):
-        if path.relative_to(folder).as_posix() not in histories:
+        if path.relative_to(folder).as_posix() not in known:
             path.unlink()
     damaged = work.find_damage()
     return f"{damaged} is missing or damaged" if damaged else ""

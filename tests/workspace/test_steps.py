@@ -55,14 +55,14 @@ def test_a_result_of_another_version_is_as_good_as_none(finished):
 
 def test_an_empty_folder_has_nothing_finished(tmp_path):
     assert done(tmp_path) == []
-    assert StepFolder(tmp_path).is_empty
+    assert not StepFolder(tmp_path).steps
     assert StepFolder(tmp_path).find_damage() == ""
 
 
 def test_a_step_counts_for_its_key_alone(tmp_path):
     StepFolder(tmp_path, key="a").finish("features")
     assert StepFolder(tmp_path, key="a").is_finished("features")
-    assert StepFolder(tmp_path, key="b").is_empty
+    assert not StepFolder(tmp_path, key="b").steps
     StepFolder(tmp_path, key="b").forget("features")
     assert done(tmp_path, key="a") == ["features"]
     StepFolder(tmp_path, key="b").finish("features")
@@ -112,7 +112,17 @@ def test_a_step_leaves_files_besides_its_folder(tmp_path):
     lambda log: log.write_text(log.read_text().replace('"rows": 3', '"rows": 4', 1))])
 def test_a_log_that_is_missing_or_was_changed_proves_nothing(finished, damage):
     damage(finished / LOG)
-    assert done(finished) == []
+    with pytest.raises(ValueError, match=r"plain file|line 1"):
+        StepFolder(finished).refuse_damaged_log()
+    assert "features" not in done(finished)
+    StepFolder(finished).finish("features", Counted(rows=5))
+    assert StepFolder(finished).find("features", Counted) == Counted(rows=5)
+
+
+def test_a_damaged_line_voids_all_before_it(finished):
+    log = finished / LOG
+    log.write_text(log.read_text().replace('"matches"', '"Matches"', 1))
+    assert done(finished) == ["model", "sparse", "undistorted"]
 
 
 def test_half_a_line_counts_for_nothing_and_the_next_one_stands(finished):

@@ -132,7 +132,7 @@ def run_job(
     try:
         _run(job, job.max_minutes, Monitor(job, progress, record, on_idle))
     except TimeUpError as error:
-        if job.tried.is_empty:
+        if not job.tried.steps:
             raise
         logger.warning("sfm: %s The best model so far is taken.", error.message)
         _run(replace(job, max_minutes=0.0), job.max_minutes,
