@@ -92,7 +92,7 @@ def take_over(
         known = SfmSummary.from_json(summary)
     except ManifestError:  # of another version
         return False
-    log, current = StepFolder(finished)(out).result("model", ModelResult)
+    log, current = StepFolder(finished), StepFolder(out).find("model", ModelResult)
     found = log.find("model", ModelResult)
     needed = log.files("model")
     intact = set(touched).isdisjoint((*needed, LOG))
