@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, Hint, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.face_frames import read_face_frames
@@ -24,7 +24,7 @@ from recon_cli.scene.scene import Scene, View, split_views
 from recon_cli.workspace.paths import refuse_special
 
 _PINHOLE = 1  # COLMAP's id of the model with fx, fy, cx, cy
-_HINT = "Run `recon sfm --again`."
+_HINT = Hint("sfm", again=True)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,9 @@ def read_cameras(path: Path) -> dict[int, Pinhole]:
     return cameras
 
 
-def read_images(path: Path, *, hint: str = _HINT) -> list[tuple[str, int, NDArray[np.float64]]]:
+def read_images(
+    path: Path, *, hint: str | Hint = _HINT
+) -> list[tuple[str, int, NDArray[np.float64]]]:
     """Returns (name, camera id, [4, 4] world to camera) of each image of an images.bin."""
     reader = Reader(path, hint)
     images = []
@@ -119,7 +121,9 @@ def read_images(path: Path, *, hint: str = _HINT) -> list[tuple[str, int, NDArra
     return images
 
 
-def read_points(path: Path, *, hint: str = _HINT) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def read_points(
+    path: Path, *, hint: str | Hint = _HINT
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.bin, sorted by point id."""
     rows = sorted(row[:7] for row in _read_point_rows(path, hint))
     positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
@@ -156,7 +160,7 @@ def read_visibility(sparse: Path) -> dict[str, NDArray[np.int64]]:
             for number, name in names.items()}
 
 
-def _read_point_rows(path: Path, hint: str) -> list[tuple[Any, ...]]:
+def _read_point_rows(path: Path, hint: str | Hint) -> list[tuple[Any, ...]]:
     """Returns id, position, colour and error of each point."""
     reader = Reader(path, hint)
     rows = []
@@ -236,7 +240,7 @@ def write_colmap(
     observations are written. InputError if there are no views, or the folder holds something.
     """
     if not views:
-        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+        raise InputError("There are no cameras to write.", hint=Hint("sfm", then=" first"))
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder} is not empty.", hint="Name another folder, or remove it.")
     model = _model(views)
@@ -320,7 +324,7 @@ def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:
 class Reader:
     """Reads values from a binary file, and refuses one that ends too soon or too late."""
 
-    def __init__(self, path: Path, hint: str) -> None:
+    def __init__(self, path: Path, hint: str | Hint) -> None:
         self._path = path
         self._hint = hint
         self._at = 0
@@ -376,6 +380,6 @@ def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
     return matrix
 
 
-def model_error(path: Path, fault: str, hint: str) -> FormatError:
+def model_error(path: Path, fault: str, hint: str | Hint) -> FormatError:
     """Returns the error for a damaged file."""
     return FormatError(f"{path} is not a complete COLMAP model: {fault}.", hint=hint)
