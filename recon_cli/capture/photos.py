@@ -15,7 +15,7 @@ from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
 from recon_cli.capture.known_files import picture_kind
 from recon_cli.capture.panoramas import choose_projection
 from recon_cli.capture.photo_tree import find_videos
-from recon_cli.errors import InputError, format_count, list_names
+from recon_cli.errors import InputError, command_line, format_count, list_names, name_command
 from recon_cli.io.views import evenly_spread
 
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
@@ -126,7 +126,7 @@ def unfold_advice(photo: Photo) -> str:
         "magick {file} -coalesce {target}")
     folder = shlex.quote(str(photo.path.with_suffix("")) + "_pictures")
     command = program.format(file=shlex.quote(str(photo.path)), target=f"{folder}/%04d.png")
-    return f"To use all: mkdir -p {folder} && {command} && recon ingest {folder}"
+    return f"To use all: mkdir -p {folder} && {command} && {command_line(f'ingest {folder}')}"
 
 
 def _natural_key(stem: str) -> list[tuple[int, str]]:
@@ -161,8 +161,8 @@ def _count_hint(folder: Path) -> str:
     if videos:
         named = shlex.quote(str(videos[0]))
         return (f"It holds {format_count(len(videos), 'video')}: "
-                f"{list_names([path.name for path in videos])}. Type `recon ingest "
-                f"{named}`, or give several that show one room.")
+                f"{list_names([path.name for path in videos])}. Type "
+                f"{name_command(f'ingest {named}')}, or give several that show one room.")
     return ("Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, HEIC, "
             "camera RAW).")
 

@@ -34,7 +34,7 @@ from recon_cli.datasets.posed import (
 )
 from recon_cli.datasets.rgbd import read_matrix, read_pose
 from recon_cli.datasets.trajectory import Trajectory
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.io.calibration import lens_from_matrix
 from recon_cli.scene.camera import Lens, make_lens
 
@@ -111,7 +111,7 @@ def _kinect(
                    for params in (_COLOR_KINECT, _DEPTH_KINECT))
     table.notices.append(
         f"it has no {_INTRINSICS}: a Kinect's usual focal length of {_COLOR_KINECT[0]:.0f} pixels "
-        "is assumed; `recon sfm --poses refine` corrects it")
+        f"is assumed; {name_command('sfm --poses refine')} corrects it")
     return lens, depth
 
 
@@ -144,7 +144,7 @@ def read_tum(folder: Path) -> PosedSet:
     if not camera:
         table.notices.append(
             f"its name holds neither freiburg1, 2 nor 3: a Kinect's usual focal length of {fx:.0f} "
-            "pixels is assumed; `recon sfm --poses refine` corrects it")
+            f"pixels is assumed; {name_command('sfm --poses refine')} corrects it")
     return replace(table.finish(), metric=True, sequence=True)
 
 

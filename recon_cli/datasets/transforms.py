@@ -32,7 +32,7 @@ from recon_cli.datasets.posed import (
     resolve_inside,
 )
 from recon_cli.datasets.split_lists import PARTS, match_parts, split_parts
-from recon_cli.errors import FormatError, InputError, format_count
+from recon_cli.errors import FormatError, Hint, InputError, format_count
 from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
 from recon_cli.scene.camera import Camera, Lens, make_lens
 from recon_cli.workspace.atomic import read_json, write_json
@@ -399,7 +399,7 @@ def write_transforms(
     view.
     """
     if not views:
-        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+        raise InputError("There are no cameras to write.", hint=Hint("sfm", then=" first"))
     names = [name for name, _ in views]
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:

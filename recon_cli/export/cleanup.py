@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, name_command
 from recon_cli.render import RenderOutput, render
 from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
@@ -119,7 +119,7 @@ def _drop(splats: Splats, removed: Tensor, option: str) -> Splats:
     if not torch.any(remaining):
         raise ConfigError(
             f"{option} would remove all {len(splats):,} Gaussians.",
-            hint="Check that the views show the scene: `recon render --views train`.")
+            hint=f"Check that the views show the scene: {name_command('render --views train')}.")
     return splats.select(remaining)
 
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import read_bytes, write_bytes
@@ -59,7 +59,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
 def _read(path: Path, flags: int, kind: str) -> NDArray[np.uint8]:
     data = decode_file(path, flags)
     if data is None:
-        raise FormatError(f"{path} cannot be read as {kind}.", hint="Run `recon sfm --again`.")
+        raise FormatError(f"{path} cannot be read as {kind}.", hint=Hint("sfm", again=True))
     return data
 
 

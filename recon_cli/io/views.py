@@ -7,13 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from recon_cli.errors import Hint
 from recon_cli.io.images import fit_camera, read_masked_image
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import View
 from recon_cli.scene.train_view import MIN_PIXELS, TrainView, leaves_enough
 
-MASK_HINT = "Run `recon ingest` with masks that hide less."
+MASK_HINT = Hint("ingest", then=" with masks that hide less")
 _Item = TypeVar("_Item")
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.io.colmap import read_images, read_points
 from recon_cli.io.images import fit_image, read_png
 from recon_cli.report.capture import draw_plan, find_axes
@@ -28,7 +28,7 @@ from recon_cli.workspace.summaries import PartSummary, SfmSummary
 _MOST = 12  # parts on the page
 MARGIN = 2.0  # seconds to film before and after a moment, so that the new film ties to both parts
 _THUMB_SIDE, _THUMB_QUALITY = 360, 75
-_HINT = "Run `recon sfm --again`."
+_HINT = Hint("sfm", again=True)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import WorkspaceError
+from recon_cli.errors import WorkspaceError, name_command
 from recon_cli.io.meshes import Mesh, read_mesh, write_mesh
 from recon_cli.room.measures import RoomFrame, measure_room
 from recon_cli.room.mesh import MeshResult
@@ -60,7 +60,7 @@ def _verify_mesh(
     if not same:
         raise WorkspaceError(
             f"{path} does not read back as the mesh that was written.",
-            hint="Check the disk, then run `recon export --again`.")
+            hint=f"Check the disk, then run {name_command('export --again')}.")
 
 
 def _same_look(back: Mesh, mesh: Mesh, tinted: bool) -> bool:

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ReconstructionError
+from recon_cli.errors import ReconstructionError, name_command
 from recon_cli.io.meshes import Mesh, simplify
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.kernels.viewpoint import viewpoint
@@ -87,7 +87,7 @@ def build_mesh(
     if not maps.median > 0:
         raise ReconstructionError(
             "There is no surface to make a mesh of: no view shows an opaque one.",
-            hint="Train longer, or look at the scene with `recon view`.")
+            hint=f"Train longer, or look at the scene with {name_command('view')}.")
     if len(views) > 1:
         means = splats.means.detach().cpu().numpy().astype(np.float64)
         maps = with_stereo(maps, (means.min(axis=0), means.max(axis=0)), ctx.progress)
@@ -113,7 +113,7 @@ def mesh_of(
     if not len(faces):
         raise ReconstructionError(
             "There is no surface to make a mesh of: the views do not agree on any.",
-            hint="Check the cameras with `recon report`, or train longer.")
+            hint=f"Check the cameras with {name_command('report')}, or train longer.")
     before = len(faces)
     vertices, faces = _used(*simplify(vertices, faces, max_triangles, ctx.threads))
     if not len(faces):

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
 from recon_cli.splats.foreign import (
@@ -339,7 +339,7 @@ def _vertices(header: Header) -> NDArray[np.void]:
     if row is not None and "packed_position" in (row.names or ()):
         raise FormatError(
             f"{header.path} is a compressed .ply, which has another layout.",
-            hint="Use `recon import` or `recon convert`, which read it.")
+            hint=f"Use {name_command('import')} or {name_command('convert')}, which read it.")
     tables = read_tables(header)
     if row is None:
         raise FormatError(f"{header.path} holds vertices with lists, which Gaussians do not have.",

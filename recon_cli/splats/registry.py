@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
@@ -37,8 +37,8 @@ def _format_by_name(path: Path) -> ExportFormat:
     if not found:
         raise FormatError(
             f"{path} is not of a known format of Gaussians.",
-            hint=f"Known are {', '.join(row.ending for row in READABLE)}; `recon run` reads videos "
-            "and photos.")
+            hint=f"Known are {', '.join(row.ending for row in READABLE)}; "
+            f"{name_command('run')} reads videos and photos.")
     return max(found, key=lambda row: len(row.ending))  # .compressed.ply before .ply
 
 
@@ -69,8 +69,8 @@ def put_in_place(scene: LoadedScene, name: str) -> Splats:
     """Returns the Gaussians where the file `name` has them, with a warning if that rounds."""
     if scene.origin is None:
         return scene.splats
-    logger.warning("%s: %s, and added again here, rounded; `recon import` leaves it out",
-                   name, scene.origin.describe())
+    logger.warning("%s: %s, and added again here, rounded; %s leaves it out",
+                   name, scene.origin.describe(), name_command("import"))
     return replace(scene.splats, means=scene.splats.means + torch.tensor(scene.origin.point))
 
 

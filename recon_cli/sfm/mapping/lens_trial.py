@@ -68,8 +68,7 @@ class BetterLens(JsonRecord):
     def sentence(self) -> str:
         """Returns what is wrong, and what to type."""
         text = self.describe()
-        return (f"{text[:1].upper()}{text[1:]}: `recon sfm --camera-model {self.better}` uses "
-                "that.")
+        return f"{text[:1].upper()}{text[1:]}: --camera-model {self.better} uses that."
 
 
 def find_better_lenses(

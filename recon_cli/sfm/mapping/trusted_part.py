@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from recon_cli.errors import SfmError
+from recon_cli.errors import SfmError, name_command
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.limits import MIN_FRAMES, MIN_IMAGES_PRINCIPAL, MIN_PARALLAX_DEG
@@ -156,8 +156,8 @@ def _check_share(
     if parts and (count >= job.min_registered * len(asked) or not broken):
         return
     more = JOIN_PANORAMAS if job.panoramas else (
-        "Use more frames between the parts (`recon ingest --frames N`), or match all of them "
-        "(--pairs exhaustive).")
+        f"Use more frames between the parts ({name_command('ingest --frames N')}), or match all "
+        "of them (--pairs exhaustive).")
     named = "; ".join(f"{len(names)} ({names[0]} to {names[-1]})" for names in held[:_MOST_NAMED])
     problem = (verdict.problems or ("The capture split into disconnected models.",))[0]
     raise SfmError(
