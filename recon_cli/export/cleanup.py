@@ -32,17 +32,17 @@ from torch import Tensor
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
 from recon_cli.render import RenderOutput, render
+from recon_cli.render.contract import ALPHA_MIN
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.values import measure_distances, measure_extent
 
 _TOUCH = 3.0  # standard deviations
 _NEIGHBOURS = 16  # compared with each; a surface around a Gaussian has about six
 _SMALL = 0.005  # of the Gaussians at most
 _APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
-_BULK = 0.9  # of the scene lies within its radius
 _EDGE = 0.005  # of the scene lies beyond each side of its box
-_VISIBLE = 1 / 255  # fainter ones are not rendered, and touch nothing
 # Measurements behind these constants: tests/bench/notes/scenes.md.
 _WEIGHT = 0.01  # alpha T; below, a view does not show it. RadSplat's threshold for high quality
 _FEW = 2  # views
@@ -96,9 +96,8 @@ def drop_floaters_without_views(splats: Splats, room: tuple[list[float], float])
     [3] and radius. ConfigError if nothing would be left.
     """
     means, opacities = splats.means.detach().double(), splats.opacities.detach()
-    invisible = opacities < _VISIBLE
-    away = (means - means.median(dim=0).values).norm(dim=1)
-    bulk = away.sort().values[round(_BULK * (len(away) - 1))]
+    invisible = opacities < ALPHA_MIN
+    away, bulk = measure_distances(means)
     large = splats.scales.detach().amax(dim=1) > _HAZE * away.clamp_min(bulk)
     haze = (opacities < _FAINT) & large & ~invisible
     alone = torch.zeros_like(invisible)
@@ -254,7 +253,7 @@ def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor
     None if unknown. Groups outside the box of the scene that a view shows, through a window, are
     not islands.
     """
-    drawn = (near & (splats.opacities >= _VISIBLE)).cpu()
+    drawn = (near & (splats.opacities >= ALPHA_MIN)).cpu()
     rows = torch.nonzero(drawn)[:, 0]
     is_island = torch.zeros(len(splats), dtype=torch.bool)
     if len(rows) <= _NEIGHBOURS:
@@ -309,8 +308,7 @@ def _find_far_groups(
 ) -> NDArray[np.bool_]:
     """Returns for each group whether it lies completely apart from the main one."""
     scene = means[group == main]
-    middle = np.median(scene, axis=0)
-    radius = np.quantile(np.linalg.norm(scene - middle, axis=1), _BULK)
+    _, radius = measure_extent(scene)
     nearest = np.full(int(group.max()) + 1, np.inf)
     distance, _ = cKDTree(scene).query(means)
     np.minimum.at(nearest, group, distance)

@@ -15,7 +15,7 @@ SIDE = 8  # voxels along the side of a block
 CELLS = SIDE**3
 _BLOCKS_AT_ONCE, _VERTICES_AT_ONCE = 64, 256
 _HALF_DIAGONAL = 0.8660254  # of a cube
-_LEAST_COSINE = 0.1  # between ray and normal, for a view to count as one of this side
+LEAST_COSINE = 0.1  # between ray and normal, for a view to count as one of this side
 # columns of the counts of `observe`
 SHOWN, SEEN_THROUGH = 0, 1
 
@@ -115,7 +115,7 @@ def observe(counter, points, normals, view, depth, image, tolerance, near, count
             dx, dy, dz = view.center[0] - wx, view.center[1] - wy, view.center[2] - wz
             length = math.sqrt(dx * dx + dy * dy + dz * dz)
             cosine = (dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2]) / length
-            if seen <= 0 or cosine < _LEAST_COSINE:
+            if seen <= 0 or cosine < LEAST_COSINE:
                 continue
             if z < seen - tolerance * z:
                 counts[i, SEEN_THROUGH] += 1

@@ -30,7 +30,7 @@ STEPS = 1 + _CORRECTIONS  # of each view
 _OFFSET, _STEP = 128, 2.0  # of bytes that say what is missed: no error, and levels of a step
 _SMALLEST = 256  # texels, of the last half
 MOST_PIXELS = 50_000_000  # of all photos; 11 bytes of each are in memory
-_TOLERANCE = 0.025  # of a depth, within which a view shows a texel
+TOLERANCE = 0.025  # of a depth, within which a view shows a texel or vertex
 _FEATHER = 6  # pixels within which a view fades towards what hides a surface
 _JUMP = 0.03  # of 1 / depth, from which on neighbouring pixels lie on two surfaces
 _SAMPLES = 6000  # vertices by which photos are compared
@@ -126,7 +126,7 @@ def paint(
         covered = np.zeros((side, side), np.uint8)
         pixels = np.concatenate([image.reshape(-1, 3) for image in images])
         pool.run(bake, places, outward, unseen, charts.faces, charts.corners * (side / size), table,
-                 starts.astype(np.int64), pixels, nearness, quality, _TOLERANCE, texture, covered)
+                 starts.astype(np.int64), pixels, nearness, quality, TOLERANCE, texture, covered)
         return fill_gaps(texture, covered > 0)
 
     painted = mean([view.image for view in views], table, colors[charts.rows], size)
@@ -237,7 +237,7 @@ def _measure(
     inside = ((places[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < camera.width)
               & (row < camera.height) & (cosine > _LEAST_COSINE))
     column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    inside &= np.abs(one.nearness[row, column] - places[:, 2]) < _TOLERANCE * places[:, 2]
+    inside &= np.abs(one.nearness[row, column] - places[:, 2]) < TOLERANCE * places[:, 2]
     if view.mask is not None:
         inside &= view.mask[row, column]
     soft = cv2.blur(view.image, (5, 5)).astype(np.float64)

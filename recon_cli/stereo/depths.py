@@ -36,7 +36,7 @@ _LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
 # The second one, about what the first found: a window then follows slanted surfaces.
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 _EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
-_TOLERANCE = 0.015  # of a depth, within which another view confirms it
+TOLERANCE = 0.015  # of a depth, within which another view confirms it
 _FRONTAL = np.zeros(3)  # planes parallel to each image
 _WINDOW, _TEXTURE = 5, 6.0  # pixels a side; deviation of grey levels at which a plane counts 1/e
 _SMALL = 16  # pixels a side
@@ -257,7 +257,7 @@ def _confirmed(
     for own, depth in enumerate(depths):
         agree, through = np.zeros((2, depth.size), np.int32)
         others = partners[own][partners[own] >= 0]
-        pool.run(compare, flat, starts, table, own, others, _TOLERANCE, near, agree, through,
+        pool.run(compare, flat, starts, table, own, others, TOLERANCE, near, agree, through,
                  scratch=False)
         confirmed.append(agree.reshape(depth.shape) > 0)
     return confirmed

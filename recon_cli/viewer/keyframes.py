@@ -16,10 +16,10 @@ from viser.transforms import SO3
 
 from recon_cli.errors import ReconError, WorkspaceError
 from recon_cli.flythrough.camera_path import CameraPath, write_camera_path
+from recon_cli.flythrough.request import FPS
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.camera_paths import keyframe_path
 
-FPS = 30.0  # of the file, as that of `recon render`
 SIZE = (1280, 720)  # of the file, where there is no capture whose shape it could have
 _PREVIEW_FPS = 20.0  # browsers move smoothly, and a slow connection keeps up
 _SECONDS = 4.0  # from keyframe to keyframe, at first
