@@ -33,6 +33,7 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
 from recon_cli.render import RenderOutput, render
 from recon_cli.render.contract import ALPHA_MIN
+from recon_cli.render.depth_loss import LEAST_COVERAGE
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -47,10 +48,9 @@ _EDGE = 0.005  # of the scene lies beyond each side of its box
 _WEIGHT = 0.01  # alpha T; below, a view does not show it. RadSplat's threshold for high quality
 _FEW = 2  # views
 _IN_FRONT = 0.5  # of the depth of the surface behind
-_SOLID = 0.5  # coverage from which something counts as behind
 _HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
 _FAINT = 0.1  # opacity; without views only such a large Gaussian counts as haze
-_HAZE = 0.1  # of the distance from the middle, at least of the radius
+HUGE = 0.1  # of the distance from the middle, at least of the radius
 _WORST = 0.2  # of the greatest harm: the threshold of a round
 _ROUNDS = 12
 
@@ -98,7 +98,7 @@ def drop_floaters_without_views(splats: Splats, room: tuple[list[float], float])
     means, opacities = splats.means.detach().double(), splats.opacities.detach()
     invisible = opacities < ALPHA_MIN
     away, bulk = measure_distances(means)
-    large = splats.scales.detach().amax(dim=1) > _HAZE * away.clamp_min(bulk)
+    large = splats.scales.detach().amax(dim=1) > HUGE * away.clamp_min(bulk)
     haze = (opacities < _FAINT) & large & ~invisible
     alone = torch.zeros_like(invisible)
     rows = torch.nonzero(splats.within(*room) & ~invisible)[:, 0]
@@ -243,7 +243,7 @@ def _is_before(means: Tensor, camera: Camera, behind: RenderOutput) -> Tensor:
     column = (camera.fx * x / ahead + camera.cx).long().clamp(0, camera.width - 1)
     line = (camera.fy * y / ahead + camera.cy).long().clamp(0, camera.height - 1)
     cover = behind.alpha[line, column]
-    return (cover >= _SOLID) & (z * cover < _IN_FRONT * behind.depth[line, column])
+    return (cover >= LEAST_COVERAGE) & (z * cover < _IN_FRONT * behind.depth[line, column])
 
 
 def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor:

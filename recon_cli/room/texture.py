@@ -22,7 +22,7 @@ from recon_cli.room.mesh_planes import vertex_normals
 from recon_cli.room.texture_kernels import COLUMNS, GAIN, WEIGHT, bake, draw, shade
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import camera_row
+from recon_cli.stereo.depths import EDGE, camera_row
 
 _SHARPER = 4.0  # exponent of how sharp a view is, in its weight
 _CORRECTIONS = 2  # by what the texture misses of the photos
@@ -32,7 +32,6 @@ _SMALLEST = 256  # texels, of the last half
 MOST_PIXELS = 50_000_000  # of all photos; 11 bytes of each are in memory
 TOLERANCE = 0.025  # of a depth, within which a view shows a texel or vertex
 _FEATHER = 6  # pixels within which a view fades towards what hides a surface
-_JUMP = 0.03  # of 1 / depth, from which on neighbouring pixels lie on two surfaces
 _SAMPLES = 6000  # vertices by which photos are compared
 _ROUNDS = 4  # of that comparison
 _DARK, _BRIGHT = 12.0, 243.0  # beyond, pixels may be clipped
@@ -196,7 +195,7 @@ def usable(
     bend = np.maximum(np.abs(nearness[1:-1, :-2] + nearness[1:-1, 2:] - 2 * middle),
                       np.abs(nearness[:-2, 1:-1] + nearness[2:, 1:-1] - 2 * middle))
     calm = np.zeros(nearness.shape, np.uint8)
-    calm[1:-1, 1:-1] = bend <= _JUMP * middle
+    calm[1:-1, 1:-1] = bend <= EDGE * middle
     if mask is not None:
         calm[~mask] = 0
     inner = cv2.distanceTransform(calm, cv2.DIST_L2, 3)

@@ -47,6 +47,7 @@ from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     HARMLESS_BYTES,
     MAX_RATIO,
+    MOST_HEAD_BYTES,
     Bytes,
     Floats,
     decode_opacities,
@@ -86,7 +87,6 @@ _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits, flags
 _MORE = struct.Struct("<I12x")  # of version 4: where the table of sizes begins
 _SIZES = struct.Struct("<QQ")  # packed, unpacked
 _EXTENSION = struct.Struct("<II")  # type, bytes that follow
-_EXTENSIONS_LIMIT = 1 << 20  # bytes
 _AXES_RECORD = struct.Struct("<III")  # type, 4, and a number of AXES from 1; 0 means none
 _AXES_BY_UP = {"z": Z_UP, "-y": PLY, "y": "rub"}  # names in version 4 of axes as they are, by up
 # A header of gzip that has no time and no system; a comment up to a 0 follows and nothing else.
@@ -363,7 +363,7 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[SpzHeader, bytes, bytes]:
     header, flags, _ = _parse(path, head, len(data))
     if header.version == 4:
         raise FormatError(f"{path} is of version 4 but packed as older ones are: it is damaged.")
-    more = _EXTENSIONS_LIMIT if flags & _Flag.EXTENSIONS else header.gaussian_bytes
+    more = MOST_HEAD_BYTES if flags & _Flag.EXTENSIONS else header.gaussian_bytes
     body = stream.decompress(stream.unconsumed_tail, sum(header.sizes) + more)
     if not stream.eof and stream.decompress(stream.unconsumed_tail, 1):
         raise _too_long_error(path)
