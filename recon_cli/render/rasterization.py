@@ -20,10 +20,11 @@ from recon_cli.render.camera_batch import Batch, BatchOptions, Gaussians
 from recon_cli.render.contract import DILATION
 from recon_cli.render.rasterization_meta import view_meta
 from recon_cli.render.registry import kernels_to_compile, prepare, resolve
+from recon_cli.scene.splats import TERMS
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-_HIGHEST_DEGREE = 3
+_HIGHEST_DEGREE = len(TERMS) - 1
 _SMALLEST_ALPHA = 1e-10  # the expected depth is divided by no smaller one, as gsplat does
 _TOLERANCE = 1e-2  # of a rotation: an optimizer's steps leave a matrix off by less
 logger = logging.getLogger("recon")

@@ -70,7 +70,7 @@ _MAX_LOGIT = math.log(254.75 / 0.25)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
 # the comment in the header: how many rows at the end show a backdrop, and its numbers
 _BACKDROP = re.compile(r"backdrop (\d{1,9})((?: \S+){7})")
-_ROUNDING = 1e-6  # of a value: by how much two machines may differ
+ROUNDING = 1e-6  # of a value: by how much two machines may differ
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 logger = logging.getLogger("recon")
@@ -297,7 +297,7 @@ def _without_sphere(splats: Splats, header_backdrop: tuple[int, Backdrop] | None
     near = splats.select(torch.arange(len(splats) - count))
     found = dataclasses.replace(near, backdrop=backdrop)
     ours = found.with_sphere().parameters()
-    same = all(ours[name].shape == value.shape and torch.allclose(ours[name], value, rtol=_ROUNDING)
+    same = all(ours[name].shape == value.shape and torch.allclose(ours[name], value, rtol=ROUNDING)
                for name, value in splats.parameters().items())
     return found if same else splats
 

@@ -13,21 +13,20 @@ from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
-from recon_cli.splats.values import read_start
+from recon_cli.splats.values import MOST_HEAD_BYTES, read_start
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, READABLE, ExportFormat
 
 logger = logging.getLogger("recon")
 
 FORMATS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
-_START = 1 << 20  # bytes of a file that its format is found in
 _READERS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in READABLE}
 
 
 def format_of(path: Path) -> ExportFormat:
     """Returns the row of a file by its first bytes, or else by its name; FormatError if unknown."""
-    start = read_start(path, _START) if path.is_file() else b""
+    start = read_start(path, MOST_HEAD_BYTES) if path.is_file() else b""
     found = [row for row in READABLE if row.signature and row.signature.match(start)]
     return found[0] if found else _format_by_name(path)
 
