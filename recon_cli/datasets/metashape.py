@@ -30,7 +30,6 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.atomic import read_text
 
 _MARKS = re.compile(rb"(?=.*<document)(?=.*<chunk)(?=.*<(?:sensor|camera))", re.DOTALL)
-_HEAD = 1 << 16  # bytes; sensors come before cameras
 _SKEW = 0.5  # pixels that leaving out b2 may move the border
 # On the earth's surface, from its centre: coordinates whose up is not z.
 _ECEF = (6.3e6, 6.4e6)  # metres
@@ -46,7 +45,7 @@ def is_metashape(path: Path) -> bool:
 def _find(path: Path) -> Path | None:
     files = [path] if path.is_file() else sorted(path.glob("*.xml"))
     return next((file for file in files if file.suffix.lower() == ".xml"
-                 and _MARKS.match(read_head(file, _HEAD))), None)
+                 and _MARKS.match(read_head(file))), None)
 
 
 @dataclass(frozen=True, eq=False)

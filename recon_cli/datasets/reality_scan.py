@@ -28,7 +28,6 @@ from recon_cli.scene.camera import Lens
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _HEAD = HEAD_LINES * 4096  # bytes
-_FILM = 36.0  # millimetres, of the longer side
 
 
 def is_reality_scan(path: Path) -> bool:
@@ -82,7 +81,7 @@ def _lens(row: Mapping[str, str], size: tuple[int, int], where: str) -> Lens:
 
     width, height = size
     scale = max(size)
-    focal = number("f") * scale / _FILM
+    focal = number("f") * scale / 36
     inner = (focal, focal, number("px") * scale + width / 2, number("py") * scale + height / 2)
     return radial_lens(size, inner, [number(key) for key in ("k1", "k2", "k3", "k4")],
                        (number("t1"), number("t2")), where)

@@ -31,8 +31,6 @@ _POSES = re.compile(r"(.+)_camera_poses(?:_(\d+))?\.txt")
 _BASE = re.compile(r"(.+)_poses\.txt")
 _NUMBERS = r"\s*:\s*\[([^\]]*)\]"
 _NEAR = 1e-4  # seconds; stamps are written with 6 decimals
-_PLUMB_BOB = (4, 5)  # k1 k2 p1 p2 (k3)
-_RATIONAL = 8  # and k4 k5 k6
 _SCALES = (2, 100, 255)  # largest values of confidence: ARKit's levels, percent, 8 bits
 _ASKED = 20  # files of confidence that are looked at for the largest value
 
@@ -209,7 +207,7 @@ def _parse_calibration(text: str, path: Path) -> tuple[Lens, NDArray[np.float64]
     if "equidistant" in text and len(distortion) >= 4:
         return make_lens("OPENCV_FISHEYE", width, height, (*inner, *_fisheye(distortion)),
                          str(path)), transform
-    if len(distortion) not in (*_PLUMB_BOB, _RATIONAL):
+    if len(distortion) not in (4, 5, 8):  # k1 k2 p1 p2 (k3), and k4 k5 k6
         raise FormatError(f"{path} has {len(distortion)} coefficients of distortion.")
     padded = (*distortion, *[0.0] * (8 - len(distortion)))
     return make_lens("FULL_OPENCV", width, height, (*inner, *padded), str(path)), transform

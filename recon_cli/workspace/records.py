@@ -13,6 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -32,8 +33,18 @@ FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = "Run `recon ingest --again`."
 POSES, POINTS = "poses.json", "points.safetensors"
 _IMPORT = "import.json"
+MIN_FRAMES = 3  # of a scene: two cameras have no third one to contradict them
 NEEDS_VIEWS_HINT = (
     "Run `recon ingest CAPTURE` and `recon sfm` in this workspace, then `recon import` again.")
+
+
+
+class Confidence(IntEnum):
+    """Levels of confidence of a sensor's depth."""
+
+    LOW = 0
+    MEDIUM = 1
+    HIGH = 2
 
 
 @dataclass(frozen=True)
