@@ -37,6 +37,7 @@ from recon_cli.capture.video_colour import (
     TRANSFERS,
     WIDE_GAMUTS,
     Transfer,
+    full_range_white,
     gray_table,
     to_srgb,
 )
@@ -48,8 +49,7 @@ SD_WIDTH, SD_HEIGHT = 1280, 576
 ROUNDED = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 # Planes: with these flags packed RGB of 16 bits (rgb48le) is garbage for 4:2:0 (swscale 9.5).
 DEEP = "gbrp16le"
-# swscale's white at 16 bits of limited range (255 * 256), and of full range as far as 8 bits go.
-WHITE = 65280
+WHITE = full_range_white(8)  # swscale's at 16 bits, of limited range too
 # H.273, table 4: how RGB became YCbCr. swscale converts RGB itself (0), BT.709, FCC, BT.601 (5 and
 # 6), SMPTE 240M and BT.2020; these it refuses.
 UNSUPPORTED_MATRICES = {
@@ -302,10 +302,10 @@ class DecodedPicture:
         return Colorspace.ITU709 if large else Colorspace.ITU601
 
     def _white(self) -> int:
-        """Returns swscale's white at 16 bits: full range of n bits ends at 2^n - 1 of 2^n."""
+        """Returns swscale's white at 16 bits."""
         full = self.frame.color_range == ColorRange.JPEG
         depth = self.frame.format.components[0].bits
-        return 65536 - (1 << 16 - depth) if full and not self.frame.format.is_rgb else WHITE
+        return full_range_white(depth) if full and not self.frame.format.is_rgb else WHITE
 
 
 def deinterlace(

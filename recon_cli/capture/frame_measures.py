@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.limits import MIN_TRACKS, RETURN_ERROR, WINDOW
+from recon_cli.capture.limits import MEASURE_SIZE, MIN_TRACKS, RETURN_ERROR, WINDOW
 from recon_cli.errors import InputError
 
 Value = TypeVar("Value", np.uint8, np.float32)
@@ -31,8 +31,6 @@ ALL_CLIPPED = 0.95
 FLAT = 4.0
 AREAS = 32  # along each side
 EVERY = 4  # pixels; a share is known well enough from every 16th
-# Pixels on the longest side: sharpness is comparable and free of the sensor noise of large frames.
-SHARPNESS_SIZE = 960
 
 
 def shrink(image: NDArray[Value], longest: int) -> NDArray[Value]:
@@ -162,7 +160,7 @@ def measure_sharpness(
 
     `hidden` [h, w], at any size, leaves out pixels that do not show the scene.
     """
-    gray = shrink(gray, SHARPNESS_SIZE)
+    gray = shrink(gray, MEASURE_SIZE)
     edges = np.asarray(cv2.Laplacian(gray, cv2.CV_32F))
     return float((edges if hidden is None else edges[_visible(hidden, gray.shape) > 0]).var())
 

@@ -25,8 +25,10 @@ from PIL import ExifTags, Image
 
 from recon_cli.capture.colour_profile import Coding, convert_coding, read_coding, to_srgb
 from recon_cli.capture.exif import ExifLens, read_exposure, read_lens
+from recon_cli.capture.limits import MEASURE_SIZE
 from recon_cli.capture.tiff import WHITE, UnsupportedError, is_misread, read_tiff
 from recon_cli.capture.unreadable import BROKEN, DAMAGED, unreadable_error
+from recon_cli.capture.video_colour import full_range_white
 from recon_cli.capture.xmp import PanoramaArea, is_panorama, panorama_area, read_xmp
 from recon_cli.errors import InputError
 from recon_cli.io.images import decode_file, fit_size
@@ -57,7 +59,6 @@ PIXEL_BYTES, WIDE_PIXEL_BYTES = 20, 32
 # depth behind, one of three bytes each; the number of components lies before it.
 CODE_STREAM, COMPONENTS, DEPTHS = b"\xff\x4f\xff\x51", 40, 42
 
-GRAY_SIZE = 960  # pixels of the longer side, at least, at which measures are taken
 # Of sensors whose values are stored in 16 bits as they are.
 NARROW = tuple(2**bits - 1 for bits in (8, 10, 12, 14))
 
@@ -143,12 +144,12 @@ def read_photo(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
 def read_gray(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
     """Returns the gray values of a photo, upright.
 
-    They may be reduced, to `GRAY_SIZE` pixels or more on the longer side.
+    They may be reduced, to `MEASURE_SIZE` pixels or more on the longer side.
     JPEG decodes to gray and to a fraction of its size in a quarter of the time.
     """
     try:
         with open_image(photo.path) as image:
-            image.draft("L", fit_size(*image.size, GRAY_SIZE))
+            image.draft("L", fit_size(*image.size, MEASURE_SIZE))
             if (image.mode in ("L", "RGB") and not photo.wide and photo.coding is None
                     and not is_misread(image) and not image.has_transparency_data):
                 gray = image.convert("L")
@@ -391,7 +392,7 @@ def _read_signal(path: Path, image: Image.Image) -> tuple[NDArray[np.uint16], in
     bits = image.info.get("bit_depth", 8) if image.format == "HEIF" else 8
     if bits > 8:
         deep = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
-        values, white = np.asarray(deep), 65536 - (1 << 16 - bits)
+        values, white = np.asarray(deep), full_range_white(bits)
     elif _is_wide(path, image) or is_misread(image):
         values, white = np.asarray(_read_wide(path, image)), WHITE
     else:

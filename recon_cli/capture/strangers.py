@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.frame_measures import shrink
-from recon_cli.capture.limits import MAX_RATIO, MIN_MATCHES, MOST_FEATURES
+from recon_cli.capture.limits import MAX_RATIO, MIN_MATCHES, MOST_FEATURES, TRACK_SIZE
 
-SIZE = 640  # pixels of the longer side
 REACH = 2.0  # pixels between a feature and the epipolar line of its match
 MOST_COMPARED = 80  # pictures that one is compared with, spread evenly
 
@@ -52,7 +51,7 @@ def find_strangers(suspects: Collection[int], others: Collection[int], read: Rea
 def find_features(gray: NDArray[np.uint8]) -> _Features:
     """Returns the SIFT features of a picture [H, W]."""
     keypoints, descriptors = cv2.SIFT.create(MOST_FEATURES).detectAndCompute(
-        shrink(gray, SIZE), None)
+        shrink(gray, TRACK_SIZE), None)
     if descriptors is None:
         descriptors = np.zeros((0, 128), np.float32)
     return _Features(

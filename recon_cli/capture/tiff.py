@@ -53,7 +53,8 @@ class TagValue(IntEnum):
     JPEG_XL = 52546  # of the compression
 
 
-_COLOURS = {Photometric.WHITE_IS_ZERO: 1, Photometric.BLACK_IS_ZERO: 1, Photometric.RGB: 3,
+_COLOURS: dict[int, int] = {
+    Photometric.WHITE_IS_ZERO: 1, Photometric.BLACK_IS_ZERO: 1, Photometric.RGB: 3,
             Photometric.CMYK: 4}  # samples of a colour
 
 
@@ -130,7 +131,7 @@ def _read_gray(
     data: bytes, tags: Mapping[int, Any], *, columns: int = 1, plane: int = 0, planes: int = 1,
 ) -> NDArray[Any]:
     """Returns a plane of several, or rows of so many columns a pixel, [H, columns * W]."""
-    entries = {tag: (tags[tag],) for tag in COPIED if tag in tags}
+    entries: dict[int, tuple[int, ...]] = {tag: (tags[tag],) for tag in COPIED if tag in tags}
     entries |= {
         tag: (tags[tag] * columns,) for tag in (Tag.ImageWidth, Tag.TileWidth) if tag in tags}
     for tag in (Tag.StripOffsets, Tag.StripByteCounts, Tag.TileOffsets, Tag.TileByteCounts):

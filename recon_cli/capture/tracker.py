@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.frame_measures import shrink
-from recon_cli.capture.limits import RETURN_ERROR, WINDOW
+from recon_cli.capture.limits import RETURN_ERROR, TRACK_SIZE, WINDOW
 from recon_cli.io.tracks import Tracks
 
-TRACK_SIZE = 640  # pixels of the longer side of a frame
 # A cell of this many pixels holds a corner, its best one: plain walls get what they have, too.
 CELL = 20
 # Smallest eigenvalue (Shi and Tomasi) of a corner over 7 x 7 pixels. A tenth of it doubled the

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from recon_cli.capture.decoded_picture import Packing
 from recon_cli.capture.frame_measures import shrink
 from recon_cli.capture.lens_border import LensCircle, fit_circle
-from recon_cli.capture.limits import MIN_MATCHES
-from recon_cli.capture.strangers import SIZE, find_features, match_features
+from recon_cli.capture.limits import MIN_MATCHES, TRACK_SIZE
+from recon_cli.capture.strangers import find_features, match_features
 
 # Of a half's sides: by how much the middle of a fisheye's circle may miss that of its half.
 OFF_CENTRE = 0.1
@@ -29,7 +29,7 @@ def has_two_circles(pictures: Sequence[NDArray[np.uint8]]) -> bool:
     """Returns whether pictures [H, W, 3] of one size show the circles of two fisheye lenses."""
     if not pictures or len({picture.shape for picture in pictures}) > 1:
         return False
-    small = [shrink(picture, 2 * SIZE).max(axis=2) for picture in pictures]
+    small = [shrink(picture, 2 * TRACK_SIZE).max(axis=2) for picture in pictures]
     brightest = np.asarray(np.max(small, axis=0), np.uint8)
     axis = int(brightest.shape[1] > brightest.shape[0])
     return all(_is_centred(fit_circle(half), half.shape) for half in _halves(brightest, axis))
@@ -53,7 +53,7 @@ def find_two_views(pictures: Sequence[NDArray[np.uint8]]) -> Packing | None:
     for packing, axis in ((Packing.SIDE_BY_SIDE, 1), (Packing.TOP_AND_BOTTOM, 0)):
         has_evidence = False
         for picture in pictures:
-            answer = _shows_twice(shrink(picture, 2 * SIZE), axis)
+            answer = _shows_twice(shrink(picture, 2 * TRACK_SIZE), axis)
             if answer is False:
                 break
             has_evidence = has_evidence or answer is True

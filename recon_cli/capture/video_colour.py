@@ -65,6 +65,11 @@ TRANSFERS: dict[int, Transfer] = {
     ColorTrc.SMPTE2084: Transfer.PQ, ColorTrc.ARIB_STD_B67: Transfer.HLG}
 
 
+def full_range_white(bits: int) -> int:
+    """Returns the white of full range at 16 bits: n bits end at 2^n - 1 of 2^n."""
+    return 65536 - (1 << 16 - bits)
+
+
 def pq_light(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the display light in cd/m2 of a PQ signal in [0, 1]; BT.2100, table 4."""
     root = signal ** (1 / PQ_M2)

@@ -37,12 +37,8 @@ _ECEF = (6.3e6, 6.4e6)  # metres
 _Component = tuple[int, str | None]  # number of the chunk, and id in it
 
 
-def is_metashape(path: Path) -> bool:
-    """Returns whether a folder has such an .xml, or a file is one."""
-    return _find(path) is not None
-
-
-def _find(path: Path) -> Path | None:
+def find_metashape(path: Path) -> Path | None:
+    """Returns the .xml of cameras in a folder, or that a file is."""
     files = [path] if path.is_file() else sorted(path.glob("*.xml"))
     return next((file for file in files if file.suffix.lower() == ".xml"
                  and _MARKS.match(read_head(file))), None)
@@ -61,7 +57,7 @@ class _Camera:
 
 def read_metashape(path: Path) -> PosedSet:
     """Returns the photos that are aligned; InputError if none is, FormatError if damaged."""
-    file = _find(path)
+    file = find_metashape(path)
     assert file is not None
     folder, cameras, worlds = file.parent, list[_Camera](), dict[_Component, Similarity | None]()
     for at, chunk in enumerate(_read_chunks(file)):

@@ -30,12 +30,7 @@ from recon_cli.datasets.posed import PosedImage, PosedSet
 _RIM, _RIM_SHARE = 15, 0.02
 
 
-def is_polycam(folder: Path) -> bool:
-    """Returns whether a folder is an export of Polycam, or its keyframes."""
-    return _keyframes(folder) is not None
-
-
-def _keyframes(folder: Path) -> Path | None:
+def find_polycam(folder: Path) -> Path | None:
     """Returns the folder of the keyframes."""
     return next((place for place in (folder / "keyframes", folder)
                  if any((place / f"{kind}cameras").is_dir() and (place / f"{kind}images").is_dir()
@@ -44,7 +39,7 @@ def _keyframes(folder: Path) -> Path | None:
 
 def read_polycam(folder: Path) -> PosedSet:
     """Returns the keyframes; InputError if none has an image and a camera."""
-    place = _keyframes(folder)
+    place = find_polycam(folder)
     assert place is not None
     for kind in ("corrected_", ""):
         images = list_numbered(place / f"{kind}images")

@@ -30,12 +30,8 @@ _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _HEAD = HEAD_LINES * 4096  # bytes
 
 
-def is_reality_scan(path: Path) -> bool:
-    """Returns whether a folder has such a .csv, or a file is one."""
-    return _find(path) is not None
-
-
-def _find(path: Path) -> Path | None:
+def find_reality_scan(path: Path) -> Path | None:
+    """Returns the .csv of cameras in a folder, or that a file is."""
     files = [path] if path.is_file() else sorted(path.glob("*.csv"))
     return next((file for file in files if file.suffix.lower() == ".csv" and any(
         set(column_names(line.split(","))) >= set(_NEEDED) for line in read_head(
@@ -44,7 +40,7 @@ def _find(path: Path) -> Path | None:
 
 def read_reality_scan(path: Path) -> PosedSet:
     """Returns the photos that the .csv lists; InputError if none is there or has a pose."""
-    file = _find(path)
+    file = find_reality_scan(path)
     assert file is not None
     folder = file.parent
     rows = [row for row in read_csv(file, _NEEDED) if row.get("name")]

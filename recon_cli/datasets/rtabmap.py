@@ -35,12 +35,7 @@ _SCALES = (2, 100, 255)  # largest values of confidence: ARKit's levels, percent
 _ASKED = 20  # files of confidence that are looked at for the largest value
 
 
-def is_rtabmap(folder: Path) -> bool:
-    """Returns whether a folder is an export of RTAB-Map with poses."""
-    return bool(_find(folder))
-
-
-def _find(folder: Path) -> list[tuple[str, str, Path, bool]]:
+def find_rtabmap(folder: Path) -> list[tuple[str, str, Path, bool]]:
     """Returns name, suffix of the camera, file of poses, and whether these are the base's."""
     cameras = []
     files = sorted(folder.glob("*_poses*.txt")) if folder.is_dir() else []
@@ -66,7 +61,7 @@ def read_rtabmap(folder: Path) -> PosedSet:
 
     InputError if there is none; FormatError if the poses have no time stamps or are damaged.
     """
-    cameras = _find(folder)
+    cameras = find_rtabmap(folder)
     table = FrameTable(folder, pictures=_pictures(folder, cameras[0][0]) or folder)
     unused = sum(_add_camera(table, folder, name, camera, path, base)
                  for name, camera, path, base in (cameras[:1] if cameras[0][3] else cameras))

@@ -73,6 +73,9 @@ MIN_COMMON_SHARE, MIN_LOOP_SHARE = 0.8, 0.5
 MAX_DRIFT_DEG, MAX_DRIFT = 15.0, 0.2
 # Times MAX_POINT_ERROR: how far apart the points of a join may be, in the median, once loops pull.
 MAX_TENSION = 3.0
+# Images per image, besides those that should overlap, that it is matched with because they look
+# alike: enough to find a loop, whose frames are matched with more of each other then.
+LOOP_CANDIDATES = 2
 # Frames; pairs whose ends are nearer than this in the walk are one witness of a loop.
 NEAR_IN_WALK = 10
 
