@@ -18,6 +18,8 @@ from typing import ClassVar
 IN_USE = "RECON_IN_USE"
 WITHOUT_WORKSPACE = ("batch", "bench", "convert", "info", "setup", "study")
 
+MOST_NAMED = 5  # things that a message lists, where a record or a log has all
+
 
 class ExitCode(IntEnum):
     """Exit codes of every command; docs/scripts.md."""
@@ -147,7 +149,7 @@ class FormatError(InputError):
     usual_hint = "Copy the file again, or write it anew with the program that made it."
 
 
-def list_names(names: Sequence[str], most: int = 5) -> str:
+def list_names(names: Sequence[str], most: int = MOST_NAMED) -> str:
     """Returns the first names and the number of the others."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

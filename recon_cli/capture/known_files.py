@@ -26,7 +26,6 @@ from recon_cli.workspace.export_formats import READABLE
 
 _READ = 1 << 23  # bytes of a file that are searched for its marks
 _TRIED = 50  # files of a pattern; a capture has thousands of one kind
-_LISTED = 0.5  # a text that names this share of the pictures belongs to them
 _TEXTS = frozenset({".csv", ".json", ".jsonl", ".tsv", ".txt", ".xml", ".yaml", ".yml"})
 _ARRAYS = frozenset({".bin", ".geojson", ".npy", ".npz", ".traj", ".tum"})
 # First bytes, their offset, and the command that unpacks such a file into a folder.
@@ -298,7 +297,7 @@ def find_lists(folder: Path, names: Sequence[str], *, known: Collection[Path]) -
     lists = []
     for path in texts if wanted else ():
         data = read_head(path)
-        if sum(name in data for name in wanted) >= _LISTED * len(wanted):
+        if 2 * sum(name in data for name in wanted) >= len(wanted):
             lists.append(path)
     return lists
 

@@ -27,7 +27,6 @@ _REDUCED = re.compile(r"images_\d+")  # nerfstudio's and COLMAP's copies beside 
 _PICTURE_FOLDERS = frozenset({
     "color", "corrected_images", "frames", "images", "input", "keyframes", "photos", "pictures",
     "rgb", "rgbd"})
-_SAME_NAMES = 0.5  # a subfolder of which more pictures are called like those above holds copies
 _VERSIONS = "other versions of these photos"
 
 
@@ -60,7 +59,7 @@ def find_photo_files(folder: Path, out: Path | None = None) -> PhotoTree:
     top = {path.stem for path in walk.folders.get(home, ())}
     for place in [place for place in walk.folders if place != home]:
         same = sum(path.stem in top for path in walk.folders[place])
-        if same > _SAME_NAMES * len(walk.folders[place]):
+        if 2 * same > len(walk.folders[place]):  # most are called like those above
             walk.aside[place] = _VERSIONS, len(walk.folders.pop(place))
     _add_beside(walk, folder, home, out)
     files = tuple(path for paths in walk.folders.values() for path in paths)

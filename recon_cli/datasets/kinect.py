@@ -39,13 +39,10 @@ from recon_cli.io.calibration import lens_from_matrix
 from recon_cli.scene.camera import Lens, make_lens
 
 _INTRINSICS = "camera-intrinsics.txt"
-_UNKNOWN = 65535.0
 # fx, fy, cx, cy of the Kinect at 640x480: nominal for colours, those of the data set for depth.
 _COLOR_KINECT = (525.0, 525.0, 320.0, 240.0)
 _DEPTH_KINECT = (585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)
-
-_TUM_DEPTH = 1 / 5000
 # fx fy cx cy k1 k2 p1 p2 k3 as the benchmark publishes them for its three cameras; the centre of
 # the first pixel is at 0 there. Sequences of other names get the nominal ones.
 _TUM_CAMERAS = {
@@ -89,7 +86,7 @@ def read_seven_scenes(folder: Path) -> PosedSet:
             viewmat = read_pose(poses.get(number))
             depth = DepthFile(
                 depths[number], MILLIMETRE, lens, depth_lens,
-                unknown=_UNKNOWN) if number in depths else None
+                unknown=np.iinfo(np.uint16).max) if number in depths else None
             table.add(PosedImage(path.name, path, lens, viewmat, depth=depth))
     return replace(table.finish(), metric=True, sequence=True)
 
@@ -140,7 +137,7 @@ def read_tum(folder: Path) -> PosedSet:
             depth = nearest(depths, time, _DEPTH_APART)
             table.add(PosedImage(
                 path.name, path, lens, viewmat,
-                depth=DepthFile(depth, _TUM_DEPTH, lens) if depth and is_file(depth) else None))
+                depth=DepthFile(depth, 1 / 5000, lens) if depth and is_file(depth) else None))
     if not camera:
         table.notices.append(
             f"its name holds neither freiburg1, 2 nor 3: a Kinect's usual focal length of {fx:.0f} "

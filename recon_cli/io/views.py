@@ -59,6 +59,12 @@ def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:
     return items[:: max(1, -(-len(items) // most))]
 
 
+def spread_inside(items: Sequence[_Item], count: int) -> list[_Item]:
+    """Returns `count` of the items, or all: the middles of so many runs of one length."""
+    count = min(count, len(items))
+    return [items[int((at + 0.5) * len(items) / count)] for at in range(count)]
+
+
 def size_summary(cameras: Sequence[Camera]) -> dict[str, Any]:
     """Returns width and height of the largest camera; where sizes differ also all as `sizes`."""
     sizes = sizes_of(cameras)

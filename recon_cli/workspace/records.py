@@ -13,6 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -32,12 +33,22 @@ FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
 AGAIN = Hint("ingest", again=True)
 POSES, POINTS = "poses.json", "points.safetensors"
 _IMPORT = "import.json"
+MIN_FRAMES = 3  # of a scene: two cameras have no third one to contradict them
 
 
 def need_views() -> str:
     """Returns the commands that give an imported scene views."""
     return (f"Run {name_command('ingest CAPTURE')} and {name_command('sfm')} in this workspace, "
             f"then {name_command('import')} again.")
+
+
+
+class Confidence(IntEnum):
+    """Levels of confidence of a sensor's depth."""
+
+    LOW = 0
+    MEDIUM = 1
+    HIGH = 2
 
 
 @dataclass(frozen=True)
