@@ -185,7 +185,7 @@ def _render_page(
     return page.encode(errors="backslashreplace")  # file names need not be UTF-8
 
 
-def render_template(name: str, environment: Environment | None = None, **values: Any) -> str:
+def render_template(name: str, environment: Environment | None = None, /, **values: Any) -> str:
     """Returns a page of this folder's templates, with the style of them all."""
     style = Markup((_HERE / "style.css").read_text(encoding="utf-8"))
     return (environment or _environment()).get_template(name).render(style=style, **values)

@@ -83,6 +83,6 @@ def _walls(corners: NDArray[np.float64], measures: RoomMeasures) -> list[Markup]
         turn = math.degrees(math.atan2(end[1] - start[1], end[0] - start[0]))
         turn -= 180 * round(turn / 180)  # never upside down
         parts.append(label(
-            *place, length.text("m"), dominant_baseline="middle",
+            float(place[0]), float(place[1]), length.text("m"), dominant_baseline="middle",
             transform=f"rotate({turn:.1f} {place[0]:.1f} {place[1]:.1f})"))
     return parts
