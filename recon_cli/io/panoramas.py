@@ -31,9 +31,10 @@ def stitch_faces(
         own = nearest == place
         local = rays[own] @ camera.viewmat[:3, :3].T
         pixels, _ = replace(camera, viewmat=np.eye(4)).project(local)
-        inside = ((pixels > -0.5) & (pixels < (camera.width + 0.5, camera.height + 0.5))).all(1)
+        inside = ((pixels > -0.5) & (pixels < (camera.width + 0.5, camera.height + 0.5))).all(
+            axis=1, keepdims=True)
         places = np.nan_to_num(pixels)[:, None].astype(np.float32) - np.float32(0.5)
-        panorama[own] = _sample(picture, places) * inside[:, None]
+        panorama[own] = _sample(picture, places) * inside
     return panorama
 
 
