@@ -56,9 +56,9 @@ from recon_cli.workspace.atomic import (
     write_json,
 )
 from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.journal import crc32
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
 from recon_cli.workspace.records import find_frames
+from recon_cli.workspace.steps import crc32
 
 RECORD = "render.json"
 PATH = "camera_path.json"

@@ -17,7 +17,7 @@ from recon_cli.jobs.executor import Executor, start_executor
 from recon_cli.room.scale import parse_place
 from recon_cli.scene.camera import MODELS, PANORAMA
 from recon_cli.sfm import database
-from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob
 from recon_cli.sfm.mapping import parts, process
 from recon_cli.sfm.mapping.time_estimate import Workload, estimate_for_notice, format_minutes
 from recon_cli.sfm.mapping.trusted_part import JOIN_PANORAMAS
@@ -31,6 +31,7 @@ from recon_cli.workspace.records import (
     describe_stretches,
     read_poses,
 )
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import (
     AttemptSummary,
     PartSummary,
@@ -92,7 +93,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     summary = _summary(frames, runs, MappingResult.read(job))
     _report(summary, frames, ctx)
     segments.remove_segments(job)
-    database.unseal(job.database)
+    database.forget_rows(job.database)
     return summary
 
 
@@ -145,7 +146,7 @@ def _time_limit(config: SfmConfig, frames: FrameList) -> float:
 
 def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
     """Tells how long the cameras will take, and the limit where it is near."""
-    if job.known_poses or job.pairs != "auto" or StepLog(job.out).is_finished("features"):
+    if job.known_poses or job.pairs != "auto" or StepFolder(job.out).is_finished("features"):
         return  # as asked for, or partly done
     mapped = segments.count_mapped(job)
     number = segments.count_segments(mapped, config.segments)

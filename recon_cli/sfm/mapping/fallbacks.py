@@ -21,7 +21,7 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching, xfeat_weights
-from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import (
     ENOUGH_FRAMES,
     FEW_PAIR_MATCHES,
@@ -154,19 +154,19 @@ def build_model(job: MappingJob, report: Reporter) -> ModelResult:
     SfmError if too few frames have a camera, they see the points from one place,
     or the parts of the model are too weakly connected.
     """
-    log = StepLog(job.attempts)
+    log = job.tried
     attempts: list[MapperAttempt] = []
     verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
     ways = list(_begin_with_fisheye(job, list_fallbacks(job), report))
     reason = ways[0].reason
     while ways:
         fallback = ways.pop(0)
-        attempt = log.result(fallback.name, MapperAttempt)
+        attempt = log.find(fallback.name, MapperAttempt)
         if attempt is None:
             attempt, candidate = _try_fallback(job, fallback, reason, attempts, report)
             if candidate is not None:
                 verdicts[fallback.name] = candidate.verdict
-            log.finish(fallback.name, attempt, job.attempts / fallback.name)
+            log.finish(fallback.name, attempt, [job.attempts / fallback.name])
         attempts.append(attempt)
         if not attempt.skipped:
             bridge = _with_bridge(job, attempts, ways, report)
@@ -377,7 +377,7 @@ def _try_fallback(
         return MapperAttempt(fallback.name, reason, skipped=skipped), None
     if wanted:
         matching.match_pairs(job, wanted, report)
-        database.seal(job.database)
+        database.record_rows(job.database)
     job = _with_own_matches(job, fallback.name)
     candidate = merge_models.best_model(
         job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS,

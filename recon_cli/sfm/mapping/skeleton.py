@@ -39,12 +39,13 @@ from recon_cli.sfm.features.keyframes import (
 )
 from recon_cli.sfm.features.matching import Pair, similar_pairs
 from recon_cli.sfm.features.pair_checks import check_pairs, list_models
-from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, is_vouched, publish, vouch
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, MIN_PAIR_INLIERS
 from recon_cli.sfm.mapping import mapper, merge_models
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.segments.loop_closure import optimize_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
+from recon_cli.workspace.steps import StepFolder
 
 MATCHES_DB = "linked.db"  # matches that may be used, in the folder of an attempt
 # Models in the folder of the attempts: from tracks, and from the coarsest features.
@@ -154,14 +155,14 @@ def _load_models(
     job: MappingJob, name: str, build: Callable[[], list[pycolmap.Reconstruction]]
 ) -> list[pycolmap.Reconstruction]:
     """Returns the models in a folder of the attempts, and builds them where it is missing."""
-    folder = job.attempts / name
-    if not is_vouched(folder):
+    folder, finished = job.attempts / name, StepFolder(job.attempts)
+    if not finished.is_intact(name):
         unfinished = fresh_folder(job.attempts / f"{name}.found")
         for index, model in enumerate(build()):
             (unfinished / str(index)).mkdir()
             write_model(model, unfinished / str(index))
         publish(unfinished, folder)
-        vouch(folder)
+        finished.finish(name, paths=[folder])
     return [pycolmap.Reconstruction(path) for path in sorted(
         folder.iterdir(), key=lambda path: int(path.name))]
 
@@ -312,7 +313,7 @@ def _fit_where_it_meets(
         *(overlapping_pairs(other, WIDEST) for other in before))
     if met - database.pair_names(source.database):
         matching.match_pairs(source, met, report)
-        database.seal(source.database)
+        database.record_rows(source.database)
         report.phase("mapping", len(job.names))
     geometries = matching.read_verified(source.database)
     checked = check_pairs(source.database, list_models([model]), geometries)

@@ -21,7 +21,7 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching
-from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
 from recon_cli.sfm.mapping import checks, fallbacks, mapper, parts
 from recon_cli.sfm.mapping.merge_models import build_posed_model
@@ -31,6 +31,7 @@ from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.verdict.evidence import gather_evidence
 from recon_cli.sfm.verdict.verdict import ModelVerdict, check_weak_link, examine
 from recon_cli.workspace.records import KnownPoses, read_poses
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import PosesSummary
 
 # Axes further apart share little: the wider side of a phone's picture spans 65 to 80 degrees.
@@ -113,7 +114,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     known = _read_poses(job)
     if job.pose_use == "keep":
         return _keep(job, known, report)
-    matched = StepLog(job.out).result("matches", MatchesResult)
+    matched = StepFolder(job.out).find("matches", MatchesResult)
     assert matched is not None, "matches come before the model"
     share = matched.poses_share
     if share is None or share >= MIN_SPOT_AGREEING:

@@ -23,10 +23,11 @@ from recon_cli.io.depth_maps import (
     read_sure_depth,
 )
 from recon_cli.room.scale_fusion import ScaleSource
-from recon_cli.sfm.job import MappingJob, StepLog
+from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.model_arrays import ModelArrays, registered_images
 from recon_cli.sfm.results import ModelResult
 from recon_cli.workspace.records import read_poses
+from recon_cli.workspace.steps import StepFolder
 
 Viewmats = Mapping[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 
@@ -75,7 +76,7 @@ def ask_device(
     if not job.known_poses or job.poses is None:
         return DeviceEvidence()
     known = read_poses(job.poses)
-    result = StepLog(job.out).result("model", ModelResult)
+    result = StepFolder(job.out).find("model", ModelResult)
     refuted = result is not None and result.poses is not None and result.poses.use == "refuted"
     if known.accuracy != "tracked" and not refuted:
         return DeviceEvidence(known.metric, known.find_up or known.up is not None, known.up)

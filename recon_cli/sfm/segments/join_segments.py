@@ -190,7 +190,7 @@ def _seed_database(job: MappingJob, index: int) -> None:
         for image in target.read_all_images():
             _copy_features(source, there[image.name], target, image.image_id)
     copy_matches(job.database, segment.database, names)
-    database.seal(segment.database)
+    database.record_rows(segment.database)
 
 
 def read_segments(job: MappingJob) -> list[Segment]:
@@ -297,7 +297,7 @@ def _join(job: MappingJob, report: Reporter) -> list[JoinedModel]:
     others = _overlapping(source, join_models(segments, groups[0]), known)
     if others - database.pair_names(source.database):
         matching.match_pairs(source, others, report)
-        database.seal(source.database)
+        database.record_rows(source.database)
         joins, groups, _ = _join_by_matches(source, segments)
     report.phase("joining", len(job.segments))
     atomic.write_json(job.out / REPORT, _describe(job, joins, groups))

@@ -42,9 +42,9 @@ from recon_cli.train.masks import with_masks
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import digest_outputs, sha256_json
-from recon_cli.workspace.journal import JOBS
 from recon_cli.workspace.layout import Workspace, disk_errors
 from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord, find_changed_outputs
+from recon_cli.workspace.steps import JOBS
 
 MOST_VIEWS = 1200  # of one model; the most that was ever trained as one
 LEAST_VIEWS = 20  # of a block, so that each view of it has neighbours
