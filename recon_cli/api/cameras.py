@@ -108,7 +108,7 @@ def read_cameras(path: str | Path, *, ignore_distortion: bool = False) -> dict[s
         raise InputError(
             f"{len(distorted)} of {len(listed)} cameras in {path} have lens distortion: "
             f"{list_names(distorted)}.",
-            hint="Undistort the images (`recon ingest` and `recon sfm` do, and so does COLMAP's "
+            hint="Undistort the images (ingest and sfm of recon do, and so does COLMAP's "
             "image_undistorter), or pass ignore_distortion=True for the pinhole part alone.")
     return {name: lens.pinhole(viewmat) for name, lens, viewmat in listed}
 

@@ -19,6 +19,7 @@ from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, is_file, re
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, NamedImage, count_images, model_suffix, read_model
 from recon_cli.io.images import decode_file
+from recon_cli.io.views import spread_inside
 from recon_cli.scene.camera import Lens
 
 logger = logging.getLogger("recon")
@@ -57,7 +58,7 @@ def _colors_agree(model: Model, folder: Path, names: list[str]) -> bool:
     step = max(1, len(model.points) // _POINTS)
     points, colors = model.points[::step], model.colors[::step].astype(np.float64)
     right = 0
-    checked = sorted({int((at + 0.5) * len(names) / _CHECKED) for at in range(_CHECKED)})
+    checked = spread_inside(range(len(names)), _CHECKED)
     for index in checked:
         pixels = decode_file(
             folder / names[index], cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -31,7 +31,7 @@ from recon_cli.workspace.export_formats import ExportFormat
 
 _IMAGES, _DEPTH, _DATABASE = "images", "depth", "database.db"
 _SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
-_MOST = 65535  # value of 16 bits
+_MOST = int(np.iinfo(np.uint16).max)  # value of 16 bits
 _UNIT = 1e-3  # of the scene, of a value of 1: millimetres, nerfstudio's default
 # Standard deviation of a camera's place in a room, in metres: what bundle adjustment leaves.
 _DEVIATION = 0.01

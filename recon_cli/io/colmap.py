@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, Hint, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.face_frames import read_face_frames
@@ -29,7 +29,7 @@ _MODELS = (
     "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE",
     "EUCM", "EQUIRECTANGULAR",
 )
-_HINT = "Run `recon sfm --again`."
+_HINT = Hint("sfm", again=True)
 
 
 def read_scene(
@@ -85,7 +85,7 @@ def _read_views(sparse: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
     return [(name, lenses[camera_id], viewmat) for name, camera_id, viewmat in images]
 
 
-def read_lenses(path: Path, *, hint: str = _HINT) -> dict[int, Lens]:
+def read_lenses(path: Path, *, hint: str | Hint = _HINT) -> dict[int, Lens]:
     """Returns the intrinsics of a cameras.bin by camera id."""
     reader = Reader(path, hint)
     lenses = {}
@@ -98,7 +98,9 @@ def read_lenses(path: Path, *, hint: str = _HINT) -> dict[int, Lens]:
     return lenses
 
 
-def read_images(path: Path, *, hint: str = _HINT) -> list[tuple[str, int, NDArray[np.float64]]]:
+def read_images(
+    path: Path, *, hint: str | Hint = _HINT
+) -> list[tuple[str, int, NDArray[np.float64]]]:
     """Returns (name, camera id, [4, 4] world to camera) of each image of an images.bin."""
     images = []
     for _, name, camera_id, pose in _read_image_rows(path, hint):
@@ -109,7 +111,9 @@ def read_images(path: Path, *, hint: str = _HINT) -> list[tuple[str, int, NDArra
     return images
 
 
-def read_points(path: Path, *, hint: str = _HINT) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def read_points(
+    path: Path, *, hint: str | Hint = _HINT
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.bin, sorted by point id."""
     rows = [row for row, _ in _read_point_rows(path, hint)]
     positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
@@ -150,7 +154,7 @@ def read_observations(
 
 
 def _read_image_rows(
-    path: Path, hint: str
+    path: Path, hint: str | Hint
 ) -> list[tuple[int, str, int, list[float]]]:
     """Returns id, name, camera id, and quaternion and translation of each image."""
     reader, images = Reader(path, hint), []
@@ -162,7 +166,7 @@ def _read_image_rows(
     return images
 
 
-def _read_point_rows(path: Path, hint: str) -> list[tuple[tuple[Any, ...], tuple[int, ...]]]:
+def _read_point_rows(path: Path, hint: str | Hint) -> list[tuple[tuple[Any, ...], tuple[int, ...]]]:
     """Returns id, position and colour of each point, and the images of its track; by the ids."""
     reader, rows = Reader(path, hint), []
     for _ in range(reader.count(minimum=51)):
@@ -223,7 +227,7 @@ def write_colmap(
     observations are written. InputError if there are no views, or the folder holds something.
     """
     if not views:
-        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+        raise InputError("There are no cameras to write.", hint=Hint("sfm", then=" first"))
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder} is not empty.", hint="Name another folder, or remove it.")
     model = _model(views)
@@ -300,7 +304,7 @@ def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:
 class Reader:
     """Reads values from a binary file, and refuses one that ends too soon or too late."""
 
-    def __init__(self, path: Path, hint: str) -> None:
+    def __init__(self, path: Path, hint: str | Hint) -> None:
         self._path = path
         self._hint = hint
         self._at = 0
@@ -356,6 +360,6 @@ def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
     return matrix
 
 
-def model_error(path: Path, fault: str, hint: str) -> FormatError:
+def model_error(path: Path, fault: str, hint: str | Hint) -> FormatError:
     """Returns the error for a damaged file."""
     return FormatError(f"{path} is not a complete COLMAP model: {fault}.", hint=hint)

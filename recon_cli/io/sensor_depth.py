@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.depth_maps import (
+    LEAST_POINTS,
     MEDIAN,
     MOST_NOISE,
     DepthMap,
@@ -33,9 +34,8 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import SensorDepth
 
 MOST_SAMPLES = 16_000  # of a map, for training: one for 4 to 13 pixels of an image
-SAMPLE_BYTES = 12  # ray and depth
+SAMPLE_BYTES = 3 * np.dtype(np.float32).itemsize  # ray and depth
 ALL_SAMPLES = 400_000  # for meshes: every pixel of the sensors of phones and cheap cameras
-LEAST_POINTS = 20  # of a view, by which its own depth is judged
 FEWEST_POINTS = 200  # of all views
 MOST_POINTS = 4000  # looked at where no tracks say what views see
 LEAST_NOISE = 0.002  # relative; what depth of 16 bits and the nearest pixel leave

@@ -21,14 +21,13 @@ from recon_cli.kernels.thread_pool import pool
 from recon_cli.room.charts import plane_axes
 from recon_cli.room.depth_maps import DepthMaps
 from recon_cli.room.mesh_planes import face_geometry
-from recon_cli.room.planes import Plane, find_planes
+from recon_cli.room.planes import LEAST_COSINE, Plane, find_planes
 from recon_cli.room.texture import draw_mesh
 from recon_cli.room.texture_kernels import draw
 from recon_cli.scene.camera import Camera
 
 _BAND = 2.0  # voxels, within which surface belongs to a plane
 _NEAR = 6.0  # voxels, within which a bump is not a hole
-_LEAST_COSINE = 0.8  # between its normal and that of the plane
 _ACROSS = 0.2  # cosine between planes that meet, at most
 _CLOSED = 2  # cells of a gap in what surrounds a hole
 _REACH = 3.0  # cells, from a plane to the surface of another one that meets it
@@ -146,7 +145,7 @@ def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
     near = np.abs(corners @ plane.normal - plane.offset).max(axis=1) < _BAND * voxel
-    return np.asarray(mesh.faces[near & (normals @ plane.normal > _LEAST_COSINE * lengths)])
+    return np.asarray(mesh.faces[near & (normals @ plane.normal > LEAST_COSINE * lengths)])
 
 
 def _near_faces(plane: Plane, mesh: Mesh, reach: float) -> NDArray[np.int64]:

@@ -22,7 +22,7 @@ from recon_cli.room.mesh_planes import vertex_normals
 from recon_cli.room.texture_kernels import COLUMNS, GAIN, WEIGHT, bake, draw, shade
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import camera_row
+from recon_cli.stereo.depths import EDGE, camera_row
 
 _SHARPER = 4.0  # exponent of how sharp a view is, in its weight
 _CORRECTIONS = 2  # by what the texture misses of the photos
@@ -30,9 +30,8 @@ STEPS = 1 + _CORRECTIONS  # of each view
 _OFFSET, _STEP = 128, 2.0  # of bytes that say what is missed: no error, and levels of a step
 _SMALLEST = 256  # texels, of the last half
 MOST_PIXELS = 50_000_000  # of all photos; 11 bytes of each are in memory
-_TOLERANCE = 0.025  # of a depth, within which a view shows a texel
+TOLERANCE = 0.025  # of a depth, within which a view shows a texel or vertex
 _FEATHER = 6  # pixels within which a view fades towards what hides a surface
-_JUMP = 0.03  # of 1 / depth, from which on neighbouring pixels lie on two surfaces
 _SAMPLES = 6000  # vertices by which photos are compared
 _ROUNDS = 4  # of that comparison
 _DARK, _BRIGHT = 12.0, 243.0  # beyond, pixels may be clipped
@@ -120,7 +119,7 @@ def paint(
         covered = np.zeros((side, side), np.uint8)
         pixels = np.concatenate([image.reshape(-1, 3) for image in images])
         pool.run(bake, places, outward, unseen, charts.faces, charts.corners * (side / size), table,
-                 starts.astype(np.int64), pixels, nearness, quality, _TOLERANCE, texture, covered)
+                 starts.astype(np.int64), pixels, nearness, quality, TOLERANCE, texture, covered)
         return fill_gaps(texture, covered > 0)
 
     painted = mean([view.image for view in views], table, colors[charts.rows], size)
@@ -190,7 +189,7 @@ def usable(
     bend = np.maximum(np.abs(nearness[1:-1, :-2] + nearness[1:-1, 2:] - 2 * middle),
                       np.abs(nearness[:-2, 1:-1] + nearness[2:, 1:-1] - 2 * middle))
     calm = np.zeros(nearness.shape, np.uint8)
-    calm[1:-1, 1:-1] = bend <= _JUMP * middle
+    calm[1:-1, 1:-1] = bend <= EDGE * middle
     if mask is not None:
         calm[~mask] = 0
     inner = cv2.distanceTransform(calm, cv2.DIST_L2, 3)
@@ -227,7 +226,7 @@ def _measure(
     ray = points[rows] - view.camera.center
     cosine = -(ray * normals[rows]).sum(1) / np.linalg.norm(ray, axis=1)
     seen = (cosine > _LEAST_COSINE) & (
-        np.abs(one.nearness[row, column] - 1 / depth) < _TOLERANCE / depth)
+        np.abs(one.nearness[row, column] - 1 / depth) < TOLERANCE / depth)
     if view.mask is not None:
         seen &= view.mask[row, column]
     soft = cv2.blur(view.image, (5, 5)).astype(np.float64)

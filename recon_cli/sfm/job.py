@@ -166,7 +166,7 @@ class MappingJob(JsonRecord):
         except ManifestError as error:
             raise FormatError(
                 f"{path} is not a mapping job: {error.message}.",
-                hint="`recon sfm` writes the jobs of segments; give it one of those.") from error
+                hint="Give one of those that sfm writes for segments.") from error
 
 
 def publish(folder: Path, target: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, FormatError, format_count, list_names
+from recon_cli.errors import ConfigError, FormatError, format_count, list_names, name_command
 from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.jobs.executor import Executor, start_executor
 from recon_cli.room.scale import parse_place
@@ -199,7 +199,7 @@ def _check_frames(job: MappingJob) -> None:
         if missing:
             raise FormatError(
                 f"{folder} lacks {len(missing)} of {len(job.names)} frames: {list_names(missing)}.",
-                hint=f"Run `recon {verb} --again`.")
+                hint=f"Run {name_command(f'{verb} --again')}.")
 
 
 def _summary(frames: FrameList, runs: segments.SegmentRuns, found: MappingResult) -> SfmSummary:
@@ -238,8 +238,8 @@ def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
             ctx.notice(sentence)
     if sound and summary.rough:
         ctx.notice(f"{len(summary.rough)} of {summary.registered} cameras are rough, known badly "
-                   f"for too few points in common: {list_names(summary.rough)}; `recon report` "
-                   "says how badly.")
+                   f"for too few points in common: {list_names(summary.rough)}; "
+                   f"{name_command('report')} says how badly.")
     for sentence in (*_describe_parts(summary, frames),
                      *_describe_left_out(summary, frames, named=not sound)):
         ctx.notice(sentence)
@@ -280,8 +280,8 @@ def _describe_parts(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
         yield (f"Part {number} has {len(part.names)} of {summary.frames} frames: "
                f"{_stretches(frames, part.names)}.")
     other = 2 if summary.part == 1 else 1
-    yield (f"`recon sfm --part {other}` takes part {other}, without mapping again; `recon report` "
-           "shows what to film to join them.")
+    yield (f"{name_command(f'sfm --part {other}')} takes part {other}, without mapping again; "
+           f"{name_command('report')} shows what to film to join them.")
 
 
 def _describe_left_out(
@@ -300,7 +300,7 @@ def _describe_left_out(
         yield f"{name} was taken out of the model: {reason}."
     if missing and not (named and summary.lines):
         yield (f"Left out without a camera: {len(missing)} of {summary.frames} frames, "
-               f"{_stretches(frames, missing)}; `recon report` says why.")
+               f"{_stretches(frames, missing)}; {name_command('report')} says why.")
     if missing and any(group.lens is not None and group.lens.is_panorama
                        for group in frames.groups):
         yield JOIN_PANORAMAS

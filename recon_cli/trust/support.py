@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.render import render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -152,7 +152,7 @@ class ViewSupport:
             bits = np.unpackbits(shown.numpy(), axis=1, count=count)
         except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
             raise FormatError(
-                f"{path} cannot be read: {error}.", hint="Run `recon eval --again`.") from error
+                f"{path} cannot be read: {error}.", hint=Hint("eval", again=True)) from error
         rows = tuple(torch.from_numpy(np.nonzero(row)[0]) for row in bits)
         return ViewSupport.from_rows(rows, centers.numpy(), residual, str(head["digest"]))
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.workspace import durable, steps
 from recon_cli.workspace.paths import describe_special
 
@@ -88,7 +88,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(
-    path: Path, kind: type | None = None, *, hint: str = "", finite: bool = True
+    path: Path, kind: type | None = None, *, hint: str | Hint = "", finite: bool = True
 ) -> Any:
     """Returns the value in a JSON file, of a `kind` (dict or list) if that is given.
 

@@ -11,7 +11,7 @@ from synthetic import center_error, make_capture, part
 from recon_cli.sfm import database
 from recon_cli.sfm.features import bridge, matching, xfeat_weights
 from recon_cli.sfm.features.bridge import PhotoFeatures, find_bridge, match_rows, match_sift
-from recon_cli.sfm.features.xfeat import DESCRIPTOR_SIZE, DESCRIPTOR_STEPS, LearnedFeatures
+from recon_cli.sfm.features.xfeat import DESCRIPTOR_STEPS, LearnedFeatures
 from recon_cli.sfm.job import Reporter, parse
 from recon_cli.sfm.mapping import fallbacks, mapper
 
@@ -20,7 +20,7 @@ FOCAL, WIDTH, HEIGHT = 500.0, 640, 480
 
 
 def learned_rows(generator, count):
-    rows = generator.normal(size=(count, DESCRIPTOR_SIZE))
+    rows = generator.normal(size=(count, 64))
     rows *= DESCRIPTOR_STEPS / np.linalg.norm(rows, axis=1, keepdims=True)
     return np.rint(rows).astype(np.float32)
 
@@ -180,7 +180,7 @@ def bridges(monkeypatch):
     monkeypatch.setattr(xfeat_weights, "load_weights", dict)
     monkeypatch.setattr(bridge, "_read_photos", lambda job, _, names: {
         name: PhotoFeatures(job.names.index(name) + 1, None, None, None, LearnedFeatures(
-            np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_SIZE), np.float32))) for name in names})
+            np.zeros((0, 2)), np.zeros((0, 64), np.float32))) for name in names})
 
     def find(job, photos, pairs, _):
         with pycolmap.Database.open(job.database) as opened:

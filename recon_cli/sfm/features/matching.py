@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError, list_names
+from recon_cli.errors import FormatError, Hint, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database
 from recon_cli.sfm.database import scales
@@ -81,7 +81,7 @@ def _check_readable(job: MappingJob, readable: Collection[str]) -> None:
         raise FormatError(
             f"{len(missing)} of {len(job.names)} frames cannot be read or differ from the first in "
             f"size: {list_names(missing)}.",
-            hint="Run `recon ingest --again`.")
+            hint=Hint("ingest", again=True))
 
 
 def first_model(job: MappingJob, group: CameraGroup) -> str:

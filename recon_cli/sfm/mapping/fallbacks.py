@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 
-from recon_cli.errors import SfmError
+from recon_cli.errors import SfmError, name_command
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching, xfeat_weights
@@ -213,8 +213,8 @@ def _begin_with_fisheye(
     if job.segments:
         if all(group.model == "auto" for group in job.groups):
             report.tell("The matches are those of a fisheye lens, but the segments were mapped "
-                        "with ordinary ones: `recon sfm --segments off` maps them together, and "
-                        "as fisheyes.")
+                        f"with ordinary ones: {name_command('sfm --segments off')} maps them "
+                        "together, and as fisheyes.")
         return ways
     named = any("FISHEYE" in group.model for group in job.groups)
     reason = "--camera-model asks for it" if named else "the matches are those of a fisheye lens"
@@ -247,7 +247,8 @@ def _with_bridge(
         return None
     if not xfeat_weights.are_installed():
         report.tell("These photos are few or far apart. Learned features may match them where SIFT "
-                    f"cannot: `{xfeat_weights.COMMAND}` gets them, then run `recon sfm --again`.")
+                    f"cannot: `{xfeat_weights.COMMAND}` gets them, then run "
+                    f"{name_command('sfm --again')}.")
         return None
     from recon_cli.sfm.features import bridge  # imports torch
 

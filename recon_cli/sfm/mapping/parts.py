@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from recon_cli.errors import ConfigError, ManifestError
+from recon_cli.errors import ConfigError, ManifestError, name_command
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm.job import (
     DATABASE,
@@ -77,7 +77,8 @@ def check_part(job: MappingJob) -> None:
     named = ", ".join(f"{number} of {size} frames" for number, size in enumerate(sizes, 1))
     raise ConfigError(
         f"part is {job.part}, but the capture has {len(sizes)}: {named}.",
-        hint=f"Type `recon sfm --part {len(sizes)}`{' or a smaller number' * (len(sizes) > 1)}.")
+        hint="Type "
+        f"{name_command(f'sfm --part {len(sizes)}')}{' or a smaller number' * (len(sizes) > 1)}.")
 
 
 def take_over(

@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from recon_cli.errors import ExitCode, ReconError, SfmError, format_count
+from recon_cli.errors import ExitCode, ReconError, SfmError, format_count, name_command
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
@@ -220,7 +220,7 @@ def _timeout_error(max_minutes: float, monitor: Monitor) -> TimeUpError:
         f"The cameras were not found within {max_minutes:g} minutes; the last step was "
         f"{monitor.doing}.",
         hint="Allow more time with --max-minutes (features and matches found so far are kept), or "
-        "use fewer frames (`recon ingest --frames N`) or --max-features 1024.")
+        f"use fewer frames ({name_command('ingest --frames N')}) or --max-features 1024.")
 
 
 def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
@@ -231,7 +231,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
     if code == ExitCode.SIGNAL - ExitCode.KILLED:
         hint = (
             "The system may have run out of memory; try --max-features 1024 or fewer frames "
-            "(`recon ingest --frames N`).")
+            f"({name_command('ingest --frames N')}).")
     return CrashError(
         f"The mapping process {how} while it was {monitor.doing}. The last error in {log}: "
         f"{last_error(log)}", hint=hint)

@@ -53,7 +53,9 @@ SKELETON, COARSE_SKELETON = "skeleton", "skeleton.coarse"
 # Distances, in frames of a video, at which tracks are matches: enough for a path around a lost
 # frame. All up to 20 take twice as long; they are for videos that fall apart.
 TRACK_STEPS, ALL_TRACK_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
-REST_ROUNDS = 2  # adjustments with new points in between once all frames are placed
+# Adjustments with new points in between once all frames are placed, or segments joined: there, on
+# 300 frames, five take a tenth longer for an error of 3.25 cm in place of 3.29.
+REST_ROUNDS = 2
 LOOP_ROUNDS = 2  # times that open loops are closed and the model is fitted again
 # Share of the neighbours with MIN_PAIR_INLIERS tracks above which a video hangs together by them.
 CONTINUOUS = 0.5

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import SfmError
+from recon_cli.errors import SfmError, name_command
 from recon_cli.room.scale import (
     ARBITRARY,
     DATA_SET,
@@ -109,7 +109,7 @@ def refuse_contradiction(evidence: WorldEvidence, *, accepted: bool) -> None:
     raise SfmError(
         f"What tells the scale contradicts itself, so that no length would be right: {told}.",
         hint="Name a length that you measured with --scale-between A B METRES; or type "
-        "`recon sfm --accept-weak` for a scene in an arbitrary scale.")
+        f"{name_command('sfm --accept-weak')} for a scene in an arbitrary scale.")
 
 
 def _name_source(fused: FusedScale | None) -> str:

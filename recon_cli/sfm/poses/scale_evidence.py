@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.depth_maps import (
+    LEAST_POINTS,
     MOST_NOISE,
     find_visible,
     lens_camera,
@@ -44,7 +45,6 @@ TRACKED_ERROR, DEPTH_ERROR = 0.003, 0.005
 # share), or lengths by more than this share, in the median.
 MAX_TURN_DEG, MAX_TURN_SHARE, MAX_LENGTH_SHARE = 2.0, 0.1, 0.2
 MOST_DEPTH_MAPS = 40  # evenly spread
-FEWEST_DEPTHS = 20  # points of a frame
 _UNFIT = ("Sensor depth gives neither scale nor points: few points of the model have some, or it "
           "differs from them.")
 MAX_UP_SPREAD_DEG = 5.0  # median angle of up, by single frames, to the mean of all
@@ -207,7 +207,7 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
             lens_camera(one.lens), np.column_stack([rays, np.ones(len(rays))]))
         theirs = depth[line, column].astype(np.float64)
         known = theirs > 0
-        if known.sum() >= FEWEST_DEPTHS:
+        if known.sum() >= LEAST_POINTS:
             every.append(theirs[known] / ours[rows][known])
             ratios.append(float(np.median(every[-1])))
     if len(ratios) < FEWEST_BLOCKS:

@@ -23,6 +23,7 @@ from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.limits import (
+    LOOP_CANDIDATES,
     MAX_ERROR_PX,
     MIN_POSE_INLIERS,
     MIN_SPOT_AGREEING,
@@ -45,7 +46,6 @@ Viewmats = Mapping[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 # Pairs that are matched first, to see whether the poses fit: frames that follow each other by
 # name at these distances.
 STEPS = (1, 2)
-SIMILAR = 2  # pairs per image that look alike, besides those that overlap: they may close a loop
 # Degrees that rays to a point may be off in each adjustment, to points made anew: the tracking
 # drifts by a degree, which is 5 pixels in a small picture and 25 in a large one. At least
 # `limits.MAX_ERROR_PX`.
@@ -123,7 +123,7 @@ def match_overlapping(
     pairs = overlapping_pairs(model)
     known = pairs | near_pairs(job.names)
     alike = matching.similar_pairs(
-        job.database, job.names, seed=job.seed, nearest=SIMILAR, besides=known)
+        job.database, job.names, seed=job.seed, nearest=LOOP_CANDIDATES, besides=known)
     matching.match_pairs(
         job, known | (alike - overlapping_pairs(model, WIDEST)), report)
 

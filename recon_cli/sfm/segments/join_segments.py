@@ -26,7 +26,7 @@ from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.keyframes import choose_keyframes, name_keyframes
 from recon_cli.sfm.features.pair_checks import check_pairs, list_views
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
-from recon_cli.sfm.limits import MAX_RESIDUAL
+from recon_cli.sfm.limits import LOOP_CANDIDATES, MAX_RESIDUAL
 from recon_cli.sfm.mapping import mapper, merge_models, skeleton
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import MatchesResult, SplitResult
@@ -52,16 +52,10 @@ Pair = matching.Pair
 
 REPORT = "segments.json"  # in the stage's folder: the segments, and the evidence of their joins
 MODEL_FOLDER = "parts/1"
-# Frames of other segments that each is matched with because they look alike: enough to find loops,
-# whose frames are matched with more of each other once the segments lie beside each other.
-ALIKE = 2
 # Frames of other segments that each is matched with because it should see the same, those that look
 # alike included. Segments are rigid already: on 1,200 frames, 8 besides those end at an error of
 # .106% of the extent in 1,621 CPU seconds, 4 with them at .112% in 1,422.
 OVERLAPPING_SEGMENTS = 4
-# Adjustments of all with new points in between; segments have settled by themselves before.
-# On 300 frames five take a tenth longer for an error of 3.25 cm in place of 3.29.
-JOIN_ROUNDS = 2
 
 
 def collect_features(job: MappingJob) -> None:
@@ -137,7 +131,7 @@ def match_segments(job: MappingJob, report: Reporter) -> MatchesResult:
     if job.tracks is not None:  # segments have matched what lies near each other
         near, names = near - known, name_keyframes(Tracks.read(job.tracks))
     pairs = near | matching.similar_pairs(
-        job.database, names, seed=job.seed, nearest=ALIKE, besides=known)
+        job.database, names, seed=job.seed, nearest=LOOP_CANDIDATES, besides=known)
     matching.match_pairs(job, pairs, report)
     matching.check_motion(job)
     return matching.count_matches(job)
@@ -362,7 +356,7 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
     model = mapper.triangulate(job, _posed(job, joined), rounds=1)
     if model.num_reg_images() < len(job.names):
         model = mapper.extend_model(job, model, rounds=0)
-    mapper.refine(job, model, JOIN_ROUNDS)
+    mapper.refine(job, model, skeleton.REST_ROUNDS)
     return model
 
 

@@ -24,7 +24,7 @@ from safetensors.numpy import save_file
 from recon_cli import machine
 from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, FormatError, ManifestError, ReconstructionError
+from recon_cli.errors import ConfigError, FormatError, Hint, ManifestError, ReconstructionError
 from recon_cli.io.colmap import read_observations, write_part
 from recon_cli.io.training_scene import load_scene
 from recon_cli.jobs.executor import CORES, NEEDS_GPU, Command, Executor, start_executor
@@ -150,7 +150,7 @@ class BlockJob:
         except (AttributeError, KeyError, TypeError, ValueError, OSError, RecursionError,
                 SafetensorError) as error:
             raise FormatError(
-                f"{file} does not describe a block.", hint="Run `recon train` again.") from error
+                f"{file} does not describe a block.", hint=Hint("train", then=" again")) from error
 
     def load_scene(self) -> Scene:
         """Writes the block's part of the sparse model beside the job, and returns its scene."""
