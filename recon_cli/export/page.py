@@ -8,6 +8,7 @@ of other proportions, such as a phone held upright, show no more than that.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -68,7 +69,7 @@ def plan_tour(splats: Splats, cameras: Sequence[Camera], ctx: StageContext) -> T
     distance = float(np.median(known))
     seconds = tour_seconds(tour_path(viewmats, _DRAFT), distance)
     path = tour_path(viewmats, round(seconds / _EVERY) + 1)
-    places = [_placed(lens, viewmat) for viewmat in path]
+    places = [replace(lens, viewmat=viewmat) for viewmat in path]
     margins, shown = [], []
     for place in places:
         wide = _widened(_small(place), _MOST_MARGIN)
@@ -97,10 +98,6 @@ def draw_poster(splats: Splats, tour: Tour, ctx: StageContext) -> bytes:
     _, data = cv2.imencode(
         ".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _POSTER_QUALITY])
     return bytes(data)
-
-
-def _placed(lens: Camera, viewmat: NDArray[np.float64]) -> Camera:
-    return Camera(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, viewmat)
 
 
 def _small(camera: Camera) -> Camera:

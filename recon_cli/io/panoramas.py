@@ -32,9 +32,9 @@ def stitch_faces(
         local = rays[own] @ camera.viewmat[:3, :3].T
         pixels, _ = replace(camera, viewmat=np.eye(4)).project(local)
         ends = np.array((camera.width + 0.5, camera.height + 0.5))
-        inside = np.all((pixels > -0.5) & (pixels < ends), axis=1)
+        inside = np.all((pixels > -0.5) & (pixels < ends), axis=1, keepdims=True)
         places = np.nan_to_num(pixels)[:, None].astype(np.float32) - np.float32(0.5)
-        panorama[own] = _sample(picture, places) * inside[:, None]
+        panorama[own] = _sample(picture, places) * inside
     return panorama
 
 

@@ -67,7 +67,7 @@ class _Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _DepthView:
     """A view of the scene."""
 
     camera: Camera
@@ -85,11 +85,11 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
     """
     centers, normals, areas = face_geometry(mesh.vertices, mesh.faces)
     planes = find_planes(centers, normals, areas, _BAND * voxel)
-    views = _look(maps, mesh)
+    views = _draw_depths(maps, mesh)
     vertices, faces, count = [], [], 0
-    sheets = [(plane, mesh.vertices[_own_faces(plane, mesh, voxel)]) for plane in planes]
-    for number, (plane, own) in enumerate(sheets):
-        others = [*sheets[:number], *sheets[number + 1:]]
+    patches = [(plane, mesh.vertices[_own_faces(plane, mesh, voxel)]) for plane in planes]
+    for number, (plane, own) in enumerate(patches):
+        others = [*patches[:number], *patches[number + 1:]]
         near = mesh.vertices[_near_faces(plane, mesh, _NEAR * voxel)]
         found = _close(plane, own, near, others, views, voxel) if len(own) else None
         if found is not None:
@@ -102,17 +102,17 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
                 np.zeros((count, 3), np.uint8), np.ones(count, bool))
 
 
-def _look(maps: DepthMaps, mesh: Mesh) -> list[_Look]:
+def _draw_depths(maps: DepthMaps, mesh: Mesh) -> list[_DepthView]:
     """Returns up to `_MOST_VIEWS` of the maps, evenly spread, and the mesh in them."""
     rows = np.unique(np.linspace(
         0, len(maps.cameras) - 1, min(len(maps.cameras), _MOST_VIEWS)).round().astype(int))
-    return [_Look(maps.cameras[row], maps.depths[row], draw_mesh(
+    return [_DepthView(maps.cameras[row], maps.depths[row], draw_mesh(
         maps.cameras[row], mesh.vertices, mesh.faces).nearness) for row in rows]
 
 
 def _close(
     plane: Plane, own: NDArray[np.float64], near: NDArray[np.float64],
-    others: Sequence[tuple[Plane, NDArray[np.float64]]], views: Sequence[_Look], voxel: float,
+    others: Sequence[tuple[Plane, NDArray[np.float64]]], views: Sequence[_DepthView], voxel: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Returns vertices and triangles that close the holes of a plane; None if it has none.
 
@@ -136,7 +136,7 @@ def _close(
     holes = _without_specks(_adjoining(holes, confirmed, lines | meets))
     if not holes.any():
         return None
-    return _sheet(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
+    return _patch_mesh(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
 
 
 def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
@@ -240,7 +240,7 @@ def _pad_close(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _is_plane(
-    places: NDArray[np.float64], views: Sequence[_Look]
+    places: NDArray[np.float64], views: Sequence[_DepthView]
 ) -> NDArray[np.bool_]:
     """Returns at which places [N] views show the plane, and next to none looks through it.
 
@@ -266,7 +266,7 @@ def _without_specks(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(large[labels])
 
 
-def _sheet(
+def _patch_mesh(
     grid: _Grid, holes: NDArray[np.bool_], confirmed: NDArray[np.bool_],
     heights: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

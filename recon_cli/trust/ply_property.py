@@ -11,7 +11,7 @@ from torch import Tensor
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import ROUNDING
 from recon_cli.trust.scene_trust import Trust
-from recon_cli.trust.support import Sight
+from recon_cli.trust.support import ViewingGeometry
 
 PLY_PROPERTY = "expected_error"
 
@@ -23,7 +23,7 @@ def expected_errors(splats: Splats, trust: Trust) -> NDArray[np.float32]:
     """
     unseen = trust.support.count == 0
     angle = torch.where(unseen, torch.pi, 0.0).to(splats.means.dtype)
-    sight = Sight(angle.to(trust.support.residual.device),
+    sight = ViewingGeometry(angle.to(trust.support.residual.device),
                   torch.zeros_like(trust.support.residual))
     return trust.error.expect_gaussians(trust.support, sight)
 

@@ -31,7 +31,7 @@ from recon_cli.trust.neighbors import (
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.support import (
     MAX_VIEWS,
-    Support,
+    ViewSupport,
     error_image,
     measure_support,
 )
@@ -114,7 +114,7 @@ class TrustRecord(JsonRecord):
 class Trust:
     """The trust of a model, ready to be rendered."""
 
-    support: Support
+    support: ViewSupport
     error: ErrorModel
     sh_degree: int
 
@@ -147,7 +147,7 @@ class Trust:
         stored = record and record.model_trust(model)
         if not stored:
             return None
-        support = Support.load(evaluate / FOLDER / f"{model}.safetensors")
+        support = ViewSupport.load(evaluate / FOLDER / f"{model}.safetensors")
         return Trust(support, stored.error, sh_degree) if support.digest == digest else None
 
 
