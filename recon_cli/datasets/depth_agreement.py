@@ -298,13 +298,8 @@ def _look_up(view: DepthView, points: NDArray[np.float64]) -> NDArray[np.float64
 
     Distortion is left out: it moves few pixels to another surface.
     """
-    params = view.lens.params
-    fx, fy, cx, cy = params[:4] if len(params) > 3 else (params[0], *params[:3])
-    height, width = view.depth.shape
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = points[..., 0] / points[..., 2] * fx + cx
-        v = points[..., 1] / points[..., 2] * fy + cy
-        inside = (points[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    depths = np.zeros(inside.shape)
-    depths[inside] = view.depth[v[inside].astype(int), u[inside].astype(int)]
+    camera = view.lens.pinhole(np.eye(4))
+    depths = np.zeros(points.shape[:-1])
+    rows, column, line, _ = camera.find_visible(points.reshape(-1, 3))
+    depths.reshape(-1)[rows] = view.depth[line, column]
     return depths

@@ -32,6 +32,7 @@ from torch import Tensor
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError
 from recon_cli.render import RenderOutput, render
+from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -238,11 +239,9 @@ def _find_in_front(
 
 def _is_before(means: Tensor, camera: Camera, behind: RenderOutput) -> Tensor:
     """Returns which centres [K, 3] are far in front of a rendered surface, [K] bool."""
-    viewmat = torch.from_numpy(camera.viewmat).to(means)
-    x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(dim=1)
-    ahead = z.clamp_min(1e-6)
-    column = (camera.fx * x / ahead + camera.cx).long().clamp(0, camera.width - 1)
-    line = (camera.fy * y / ahead + camera.cy).long().clamp(0, camera.height - 1)
+    pixels, z = TensorCamera.from_camera(camera, means).project(means)
+    column, line = pixels.long().unbind(1)
+    column, line = column.clamp(0, camera.width - 1), line.clamp(0, camera.height - 1)
     cover = behind.alpha[line, column]
     return (cover >= _SOLID) & (z * cover < _IN_FRONT * behind.depth[line, column])
 

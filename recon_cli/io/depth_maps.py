@@ -119,6 +119,20 @@ def lens_camera(lens: Lens) -> pycolmap.Camera:
         model=lens.model, width=lens.width, height=lens.height, params=lens.params)
 
 
+def find_visible(
+    camera: pycolmap.Camera, local: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Returns the rows of points [P, 3] in a camera's axes that it shows, and columns and lines.
+
+    As `Camera.find_visible`, for any lens; not those that it has no pixel for.
+    """
+    rows = np.flatnonzero(local[:, 2] > 0)
+    pixels = np.asarray(camera.img_from_cam(local[rows])).reshape(-1, 2)
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    columns, lines = pixels[inside].astype(np.int64).T
+    return rows[inside], columns, lines
+
+
 def find_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Returns where depth differs much from that of a neighbour, or one is unknown, [H, W]."""
     kernel = np.ones((3, 3), np.uint8)

@@ -22,6 +22,7 @@ from recon_cli.io.depth_maps import (
     MOST_NOISE,
     DepthMap,
     find_edges,
+    find_visible,
     lens_camera,
     read_depth_list,
     read_sure_depth,
@@ -99,14 +100,8 @@ def _compare(
 ) -> NDArray[np.float64]:
     """Returns the sensor's depth over the model's at points [P, 3], where both are known."""
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    local = local[local[:, 2] > 0]
-    if not len(local):
-        return np.empty(0)
-    at = np.asarray(lens_camera(lens).img_from_cam(local)).reshape(-1, 2)
-    at = np.nan_to_num(at, nan=-1)
-    inside = ((at >= 0) & (at < (lens.width, lens.height))).all(axis=1)
-    column, row = at[inside].astype(np.intp).T
-    theirs, ours = depth[row, column].astype(np.float64), local[inside, 2]
+    rows, column, line = find_visible(lens_camera(lens), local)
+    theirs, ours = depth[line, column].astype(np.float64), local[rows, 2]
     return np.asarray(theirs[theirs > 0] / ours[theirs > 0])
 
 

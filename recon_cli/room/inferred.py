@@ -249,27 +249,13 @@ def _is_plane(
     """
     agree, crossed = np.zeros((2, len(places)))
     for view in views:
-        z, inside, row, column = _pixels(view.camera, places)
-        seen = view.depth[row, column]
-        hidden = view.nearness[row, column] > (1 + _AGREE) / z  # behind the mesh
-        looks = inside & ~hidden & (seen > 0)
-        agree += looks & (np.abs(seen - z) <= _AGREE * z)
-        crossed += looks & (seen > (1 + _AGREE) * z)
+        rows, column, line, z = view.camera.find_visible(places)
+        seen = view.depth[line, column]
+        hidden = view.nearness[line, column] > (1 + _AGREE) / z  # behind the mesh
+        looks = ~hidden & (seen > 0)
+        agree[rows] += looks & (np.abs(seen - z) <= _AGREE * z)
+        crossed[rows] += looks & (seen > (1 + _AGREE) * z)
     return np.asarray((agree > 0) & (crossed <= _MOST_CROSSED * (agree + crossed)))
-
-
-def _pixels(
-    camera: Camera, places: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """Returns depths, which places are in the image, and their rows and columns."""
-    local = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = np.where(local[:, 2] > 1e-6, local[:, 2], np.inf)
-    column = np.floor(camera.fx * local[:, 0] / z + camera.cx)
-    row = np.floor(camera.fy * local[:, 1] / z + camera.cy)
-    inside = (np.isfinite(z) & (column >= 0) & (row >= 0) & (column < camera.width)
-              & (row < camera.height))
-    return (z, inside, np.where(inside, row, 0).astype(np.int64),
-            np.where(inside, column, 0).astype(np.int64))
 
 
 def _without_specks(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:

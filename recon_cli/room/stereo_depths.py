@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from recon_cli.io.images import reduce_view
 from recon_cli.progress import Progress
 from recon_cli.room.depth_maps import DepthMaps, weigh
-from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import observe_points
+from recon_cli.scene.faces import pixel_rays
 from recon_cli.scene.gravity import find_gravity
 from recon_cli.stereo.depths import Levels, StereoView, find_depths, find_partners, unproject
 

@@ -67,8 +67,8 @@ MIN_COMMON_SHARE, MIN_LOOP_SHARE = 0.8, 0.5
 # What a way drifts: degrees, and displacement as a share of the way. Around a can whose label
 # repeats, pairs that only look alike are off by 116 degrees in the median.
 MAX_DRIFT_DEG, MAX_DRIFT = 15.0, 0.2
-# Times MAX_POINT_ERROR: how far apart the points of a join may be, in the median, once loops pull.
-MAX_TENSION = 3.0
+# Times MAX_POINT_ERROR: how far apart the points of a join may be, in the median, in a graph.
+MAX_RESIDUAL = 3.0
 # Frames; pairs whose ends are nearer than this in the walk are one witness of a loop.
 NEAR_IN_WALK = 10
 

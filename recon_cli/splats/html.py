@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import UP, turn_from
 from recon_cli.splats.format import LoadedScene, SplatFormat, Tour, WriteSettings
@@ -99,12 +99,7 @@ def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
     back = np.array([0.0, -1, 0]) if abs(up[1]) < 0.5 else np.array([0.0, 0, np.sign(up[1])])
     back -= (back @ up) * up
     offset = 2.5 * back / np.linalg.norm(back) + 0.5 * up
-    forward = -offset / np.linalg.norm(offset)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (middle + reach * offset)
+    viewmat = looking_at(middle + reach * offset, middle, up)
     width, height, focal = _DEFAULT_LENS
     return "", Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
 
@@ -170,11 +165,8 @@ def _views(
 
 def _distance(means: NDArray[np.float64], camera: Camera) -> float:
     """Returns the median depth of the centres that a camera sees; 0 if it sees none."""
-    x, y, z = camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    visible = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return float(np.median(z[visible])) if visible.any() else 0.0
+    *_, depths = camera.find_visible(means)
+    return float(np.median(depths)) if len(depths) else 0.0
 
 
 @cache

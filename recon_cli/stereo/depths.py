@@ -155,10 +155,7 @@ def unproject(
 ) -> NDArray[np.float64]:
     """Returns where some pixels of a depth map [H, W] lie, [N, 3] in world units."""
     line, column = np.divmod(pixels, depth.shape[1])
-    rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (line + 0.5 - camera.cy) / camera.fy,
-                     np.ones(len(pixels))], axis=1)
-    local = rays * depth.reshape(-1)[pixels, None] - camera.viewmat[:3, 3]
-    return np.asarray(local @ camera.viewmat[:3, :3])
+    return camera.unproject(np.stack([column, line], axis=1) + 0.5, depth.reshape(-1)[pixels])
 
 
 def compile_kernels() -> None:

@@ -225,10 +225,7 @@ def error_image(
 
 def _pixels(means: Tensor, view: TrainView) -> tuple[Tensor, Tensor]:
     """Returns line and column [K] of the pixels that centres [K, 3] fall on, on the CPU."""
-    camera = view.camera
-    local = means.detach().cpu().double().numpy() @ camera.viewmat[:3, :3].T + (
-        camera.viewmat[:3, 3])
-    depth = np.maximum(local[:, 2], 1e-9)
-    u = np.floor(camera.fx * local[:, 0] / depth + camera.cx).clip(0, camera.width - 1)
-    v = np.floor(camera.fy * local[:, 1] / depth + camera.cy).clip(0, camera.height - 1)
-    return torch.from_numpy(v.astype(np.int64)), torch.from_numpy(u.astype(np.int64))
+    pixels, _ = view.camera.project(means.detach().cpu().double().numpy())
+    last = view.camera.width - 1, view.camera.height - 1
+    column, line = torch.from_numpy(np.nan_to_num(pixels).clip(0, last)).long().unbind(1)
+    return line, column

@@ -33,6 +33,7 @@ from recon_cli.sfm.mapping import checks, mapper, merge_models, parts, skeleton,
 from recon_cli.sfm.mapping.merge_models import ModelCandidate
 from recon_cli.sfm.mapping.time_estimate import COSTS, format_minutes
 from recon_cli.sfm.mapping.trusted_part import cuts_models, deliver_parts
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.segments import join_segments
 from recon_cli.sfm.verdict.verdict import ModelVerdict, examine
@@ -280,7 +281,7 @@ def list_thin(model: pycolmap.Reconstruction) -> tuple[str, ...]:
     by images with 44 and more such points.
     """
     firm = {number for number, point in model.points3D.items() if point.track.length() > 2}
-    images = [model.image(number) for number in model.reg_image_ids()]
+    images = registered_images(model)
     thin = sorted(image.name for image in images if sum(
         point.point3D_id in firm for point in image.get_observation_points2D()) < FEW_PAIR_MATCHES)
     return tuple(thin) if len(thin) > (1 - ENOUGH_FRAMES) * len(images) else ()

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.workspace.json_record import JsonRecord
 
 # The models that are tried. FULL_OPENCV gained .3% at most over the better of the last two.
@@ -144,7 +145,7 @@ def convert(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
 def _middle(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Returns a model with the images in the middle of each camera's alone, in order of names."""
     images: dict[int, list[pycolmap.Image]] = {}
-    every = [model.image(number) for number in model.reg_image_ids()]
+    every = registered_images(model)
     for image in sorted(every, key=lambda each: each.name):
         images.setdefault(image.camera_id, []).append(image)
     rest = []
@@ -192,7 +193,7 @@ def _judge(
     squares: dict[int, list[float]] = {number: [] for number in cameras}
     for image_id in sorted(fitted.reg_image_ids()):
         image = fitted.image(image_id)
-        spots = [spot for spot in image.points2D if spot.has_point3D()]
+        spots = image.get_observation_points2D()
         if image.camera_id not in squares or not spots:
             continue
         pose = image.cam_from_world().matrix()

@@ -5,8 +5,8 @@ from tracks through every frame alone. With these cameras, the skeleton, each pa
 matches can be checked: most agree; some are off by what the cameras drift on a long way, and close
 a loop; the rest look alike but are two places, and are left out.
 
-The cameras of the skeleton are adjusted to the matches. Where that leaves a loop open they are bent
-until it closes, and adjusted again.
+The cameras of the skeleton are adjusted to the matches. Where that leaves a loop open, a pose
+graph closes it, and they are adjusted again.
 
 Photos get a skeleton from the coarsest of their features. Matching only what overlaps by it takes
 .4 to .7 of the time of matching all pairs, more of it the fewer photos there are.
@@ -42,7 +42,8 @@ from recon_cli.sfm.features.pair_checks import check_pairs, list_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, MIN_PAIR_INLIERS
 from recon_cli.sfm.mapping import mapper, merge_models
-from recon_cli.sfm.segments.loop_closure import bend_model
+from recon_cli.sfm.model_arrays import registered_images
+from recon_cli.sfm.segments.loop_closure import optimize_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
 from recon_cli.workspace.steps import StepFolder
 
@@ -53,7 +54,7 @@ SKELETON, COARSE_SKELETON = "skeleton", "skeleton.coarse"
 # frame. All up to 20 take twice as long; they are for videos that fall apart.
 TRACK_STEPS, ALL_TRACK_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
 REST_ROUNDS = 2  # adjustments with new points in between once all frames are placed
-BENDS = 2  # times that a model with open loops is bent and fitted again
+LOOP_ROUNDS = 2  # times that open loops are closed and the model is fitted again
 # Share of the neighbours with MIN_PAIR_INLIERS tracks above which a video hangs together by them.
 CONTINUOUS = 0.5
 # Pairs of photos that overlap, per image: more than of frames, as they have no neighbours. 50
@@ -289,13 +290,13 @@ def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconst
 def close_loops(
     job: MappingJob, report: Reporter, fitted: pycolmap.Reconstruction
 ) -> pycolmap.Reconstruction:
-    """Returns a fitted model, bent where loops are open and fitted again to what then agrees."""
-    for _ in range(BENDS):
+    """Returns a fitted model with its open loops closed, fitted again to what then agrees."""
+    for _ in range(LOOP_ROUNDS):
         geometries = matching.read_verified(replace(job, matches_db=None).database)
-        bent = bend_model(fitted, geometries, seed=job.seed)
-        if bent is None:
+        closed = optimize_model(fitted, geometries, seed=job.seed)
+        if closed is None:
             break
-        fitted = _fit_where_it_meets(job, report, bent, [fitted])
+        fitted = _fit_where_it_meets(job, report, closed, [fitted])
     return fitted
 
 
@@ -341,7 +342,7 @@ def _most(models: Sequence[pycolmap.Reconstruction]) -> int:
 
 def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Returns the cameras of a skeleton with the points that the matches give, adjusted."""
-    poses = {image.name: image.cam_from_world() for image in _images(skeleton)}
+    poses = {image.name: image.cam_from_world() for image in registered_images(skeleton)}
     model = mapper.triangulate(
         job, merge_models.build_posed_model(job.database, skeleton, poses), rounds=1)
     mapper.refine(job, model)
@@ -434,7 +435,3 @@ def _append_tracks(
         write = opened.update_keypoints if there else opened.write_keypoints
         write(image.image_id, np.concatenate([keypoints, followed]))
     return counts
-
-
-def _images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    return [model.image(number) for number in model.reg_image_ids()]

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import SfmError
-from recon_cli.io.colmap import Pinhole
 from recon_cli.room.scale import (
     ARBITRARY,
     DATA_SET,
@@ -34,6 +33,7 @@ from recon_cli.room.scale_fusion import (
     fuse,
     fuse_measured,
 )
+from recon_cli.scene.camera import Lens
 from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
@@ -65,7 +65,7 @@ def world_transform(
     metric: bool,  # the mapper's units are metres, as in a data set with measured poses
     sources: Sequence[ScaleSource] = (),  # what else tells the scale, in the order of trust
     given_up: tuple[float, float, float] | None = None,  # unit vector that a data set knows
-    pinholes: Mapping[str, Pinhole] | None = None,  # of undistorted frames, for FRAME:u,v
+    pinholes: Mapping[str, Lens] | None = None,  # of undistorted frames, for FRAME:u,v
 ) -> WorldFrame:
     """Returns the world frame of a model.
 

@@ -35,7 +35,8 @@ from recon_cli.sfm.mapping.prior_adjustment import (
     make_points,
     measure_deviation,
 )
-from recon_cli.sfm.segments.loop_closure import bend_model
+from recon_cli.sfm.model_arrays import registered_images, viewmat_of
+from recon_cli.sfm.segments.loop_closure import optimize_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
 from recon_cli.sfm.verdict.evidence import explained_matches
 
@@ -94,16 +95,11 @@ def match_near(job: MappingJob, viewmats: Viewmats, report: Reporter) -> PosesCh
     model = _posed(job, viewmats)
     images = {image.name: image for image in model.images.values() if image.has_pose}
     offset = _widest(model, ROUNDS_DEG[0])
-    with pycolmap.Database.open(job.database) as opened:
-        keypoints = {
-            name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
-            for name, image in images.items()}
     matches, agreeing = Counter[str](), Counter[str]()
-    for pair, geometry in matching.read_verified(job.database).items():
+    for pair, ours, theirs in matching.read_matched_pixels(
+            job.database, matching.read_verified(job.database)):
         if pair not in near or not set(pair) <= images.keys():
             continue
-        ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
-                        for side, name in enumerate(pair))
         count = int(np.count_nonzero(explained_matches(
             images[pair[0]], ours, images[pair[1]], theirs, 0.0, offset)))
         for name in pair:
@@ -147,8 +143,8 @@ def adjust_tracked(
     for number, angle in enumerate(ROUNDS_DEG):
         off = _widest(model, angle)
         if number:
-            bent = bend_model(model, matching.read_verified(job.database), seed=job.seed)
-            model = bent or model
+            closed = optimize_model(model, matching.read_verified(job.database), seed=job.seed)
+            model = closed or model
             _place(model, _follow(model, viewmats))
         make_points(model, cache, job.seed, off)
         if not number:
@@ -166,7 +162,9 @@ def adjust_tracked(
         before)
 
 
-def hold_rest(model: pycolmap.Reconstruction, held: Collection[str], viewmats: Viewmats) -> None:
+def add_prior_poses(
+    model: pycolmap.Reconstruction, held: Collection[str], viewmats: Viewmats
+) -> None:
     """Adds frames to a model, in place, where the tracking has them beside the others."""
     followed = _follow(model, viewmats)
     _place(model, {name: followed[name] for name in held})
@@ -230,7 +228,7 @@ def _place(model: pycolmap.Reconstruction, viewmats: Viewmats) -> None:
 
 def _points(model: pycolmap.Reconstruction) -> dict[str, int]:
     """Returns how many points each camera of a model sees."""
-    images = [model.image(number) for number in model.reg_image_ids()]
+    images = registered_images(model)
     return {image.name: image.num_points3D for image in images}
 
 
@@ -263,8 +261,7 @@ def _carry(
     model: pycolmap.Reconstruction, viewmats: Viewmats, start: str, name: str
 ) -> NDArray[np.float64]:
     """Returns the viewmat of a frame by the tracked motion from another one that has a camera."""
-    known = np.eye(4)
-    known[:3] = model.find_image_with_name(start).cam_from_world().matrix()
+    known = viewmat_of(model.find_image_with_name(start))
     return np.asarray(viewmats[name] @ np.linalg.inv(viewmats[start]) @ known)
 
 

@@ -26,10 +26,11 @@ from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.keyframes import choose_keyframes, name_keyframes
 from recon_cli.sfm.features.pair_checks import check_pairs, list_views
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
-from recon_cli.sfm.limits import MAX_TENSION
+from recon_cli.sfm.limits import MAX_RESIDUAL
 from recon_cli.sfm.mapping import mapper, merge_models, skeleton
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import MatchesResult, SplitResult
-from recon_cli.sfm.segments.loop_closure import Node, bend_segments, move_frames
+from recon_cli.sfm.segments.loop_closure import Node, move_frames, optimize_segments
 from recon_cli.sfm.segments.segment_joins import (
     Join,
     Placement,
@@ -204,13 +205,13 @@ def read_segments(job: MappingJob) -> list[Segment]:
 class SegmentGroup:
     """Segments that joins hold together, each frame with its motion to a common frame."""
 
-    motions: Mapping[Node, Similarity]
+    poses: Mapping[Node, Similarity]
     refused: tuple[str, ...]  # joins that were not made, in words
 
     @property
     def indices(self) -> list[int]:
         """The segments, sorted."""
-        return sorted({index for index, _ in self.motions})
+        return sorted({index for index, _ in self.poses})
 
 
 def join_all(
@@ -219,7 +220,7 @@ def join_all(
 ) -> tuple[list[Join], list[SegmentGroup]]:
     """Returns what segments say of each other by their common points, and the groups that follow.
 
-    `walk` are the verified matches of a video, whose segments drift and are bent into each other;
+    `walk` are the verified matches of a video, whose segments drift: a pose graph joins them;
     None for photos, whose segments stay as they are.
     """
     cameras = {segment.index: segment.cameras for segment in segments}
@@ -230,22 +231,22 @@ def join_all(
                        for placement in place_segments(cameras, joins)]
     while True:
         groups, torn = [], set()
-        for placement in place_segments(cameras, joins, bending=True):
-            bent = bend_segments(segments, placement.motions, common, walk, seed=seed)
-            groups.append(SegmentGroup(bent.motions, placement.refused))
-            torn |= {pair for pair, tension in bent.tension.items() if tension > MAX_TENSION}
+        for placement in place_segments(cameras, joins, with_graph=True):
+            optimized = optimize_segments(segments, placement.poses, common, walk, seed=seed)
+            groups.append(SegmentGroup(optimized.poses, placement.refused))
+            torn |= {pair for pair, off in optimized.residuals.items() if off > MAX_RESIDUAL}
         if not torn:
             return joins, groups
         joins = [dataclasses.replace(
             join, motion=None, contradictions=(
-                *join.contradictions, "bending the two cannot bring their common frames together"))
+                *join.contradictions, "no poses of the two bring their common frames together"))
             if (join.first, join.second) in torn else join for join in joins]
 
 
 def _place_rigid(segments: Sequence[Segment], placement: Placement) -> SegmentGroup:
     return SegmentGroup(
-        {(segment.index, name): placement.motions[segment.index] for segment in segments
-         if segment.index in placement.motions for name in segment.cameras.names},
+        {(segment.index, name): placement.poses[segment.index] for segment in segments
+         if segment.index in placement.poses for name in segment.cameras.names},
         placement.refused)
 
 
@@ -268,7 +269,7 @@ def join_models(segments: Sequence[Segment], group: SegmentGroup) -> JoinedModel
     owner = choose_owners(members)
     return JoinedModel(tuple(
         (move_frames(segment.model, {
-            name: group.motions[segment.index, name] for name in segment.cameras.names}),
+            name: group.poses[segment.index, name] for name in segment.cameras.names}),
          frozenset(name for name, which in owner.items() if which is segment))
         for segment in members))
 
@@ -330,8 +331,7 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
 
 
 def _images(model: pycolmap.Reconstruction, names: frozenset[str]) -> list[pycolmap.Image]:
-    images = (model.image(number) for number in model.reg_image_ids())
-    return [image for image in images if image.name in names]
+    return [image for image in registered_images(model) if image.name in names]
 
 
 def _posed(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
