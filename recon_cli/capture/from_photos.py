@@ -19,7 +19,7 @@ from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.dng_corrections import describe_corrections, read_corrections
 from recon_cli.capture.frame_selection import FrameCandidate, Reason
-from recon_cli.capture.from_video import judge, report_reduced, report_short
+from recon_cli.capture.from_video import SCAN, judge, report_reduced, report_short
 from recon_cli.capture.images import Photo, choose_white, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.known_files import find_foreign, find_lists
@@ -62,7 +62,6 @@ from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
-SEQUENCE = "sequence.json"  # which photos follow each other, for the next run; beside a scan
 # Frames that are kept of any folder, however little the camera moves: somebody may have picked
 # them, and all pairs of so many are matched in minutes.
 MIN_KEPT = 100
@@ -89,7 +88,7 @@ def ingest(
     sequence, strangers = None, list[str]()
     if not folder.panoramas:
         photos, sequence, strangers = _find_sequence(
-            photos, out / f"{prefix}{SEQUENCE}", ctx, white=white)
+            photos, out / f"{prefix}{SCAN}", ctx, white=white)
     masks = _find_masks(paths, home, photos, ctx)
     stems = make_frame_names([photo.path.stem for photo in photos])
     source = _PhotoSource(path, tuple(photos), tuple(f"{prefix}{stem}" for stem in stems),
@@ -129,10 +128,10 @@ def ingest(
 
 
 def _find_sequence(
-    photos: Sequence[Photo], record: Path, ctx: IngestContext, *, white: int
+    photos: Sequence[Photo], scan_file: Path, ctx: IngestContext, *, white: int
 ) -> tuple[list[Photo], PhotoSequence | None, list[str]]:
     """Returns the photos without strangers, those that follow each other, and the strangers."""
-    sequence = find_sequence(photos, record, ctx, white=white)
+    sequence = find_sequence(photos, scan_file, ctx, white=white)
     strangers = [] if sequence is None else [photos[place].name for place in sequence.strangers]
     strangers += [photos[place].name for place in find_odd(
         photos, () if sequence is None else (*sequence.places, *sequence.strangers), white=white)]

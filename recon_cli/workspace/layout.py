@@ -47,6 +47,7 @@ BLOCKS = "blocks"  # workspaces that `recon train --blocks` made before it was o
 SEEDS = "seeds"  # workspaces of other seeds that earlier versions made
 RENDERS = "render"  # folders of `recon render`, whose frames are kept to resume
 _OLD = ".old"  # results that were replaced
+_OLD_LOG = "steps.json"  # of the steps of earlier versions, in a stage's folder
 
 logger = logging.getLogger("recon")
 
@@ -163,7 +164,10 @@ class Workspace:
                 os.path.lexists(partial))
         if earlier.key.fingerprint != key.fingerprint:
             return "it has other settings or inputs"
-        return "" if own_digests else steps.find_damage(partial)
+        if own_digests:
+            old = (partial / _OLD_LOG).exists()
+            return "an earlier version of recon left it" * old
+        return steps.find_damage(partial)
 
     def record(self, partial_run: PartialRun) -> None:
         """Writes how much of a run would survive a crash."""

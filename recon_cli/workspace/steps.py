@@ -141,13 +141,17 @@ class StepFolder:
                 step, files=finished[step].files, key=self._key, result=finished[step].result)
 
     def find_damage(self) -> str:
-        """Returns the first step with a damaged file; empty without one.
+        """Returns the first step with a damaged file; empty without one."""
+        return next(self.list_damage(), "")
+
+    def list_damage(self) -> Iterator[str]:
+        """Yields the steps with a damaged file.
 
         Bytes that were appended since to a file that grows are cut off, as is half a line.
         """
         self._cut_off_half_line()
-        return next((step for step, history in self._known().items()
-                     if history.last.key == self._key and self._is_damaged(history)), "")
+        yield from (step for step, history in self._known().items()
+                    if history.last.key == self._key and self._is_damaged(history))
 
     def append(self, step: str, *, flush: bool = False, **values: Any) -> None:
         """Adds a line in one write, so that lines of several threads do not mix."""

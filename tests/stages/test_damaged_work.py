@@ -201,3 +201,16 @@ def test_work_of_an_undamaged_run_is_kept(tmp_path: Path) -> None:
     again, earlier = workspace.begin(key)
     assert (earlier.done, earlier.total) == (1, 2)
     assert [path.name for path in again.iterdir()] == ["kept.bin"]
+
+
+@pytest.mark.parametrize("own_digests", [True, False])
+def test_unfinished_work_of_an_earlier_version_is_begun_anew_with_a_notice(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, own_digests: bool
+) -> None:
+    workspace, key = Workspace(tmp_path), ResultKey("train", 1, {}, (), {})
+    out, _ = workspace.begin(key, own_digests=own_digests)
+    (out / "steps.json").write_text("{}")  # what that version wrote
+    steps.log_path(out).unlink(missing_ok=True)
+    again, _ = workspace.begin(key, own_digests=own_digests)
+    assert list(again.iterdir()) == []
+    assert "unfinished work is discarded" in caplog.text
