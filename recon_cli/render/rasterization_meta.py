@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.camera_batch import (
+    BatchLayout,
     BatchOptions,
     Gaussians,
-    Layout,
     compensations,
     ellipses,
     radii,
@@ -44,7 +44,7 @@ class _Later:
 
 
 def view_meta(
-    layout: Layout, inputs: Gaussians, options: BatchOptions
+    layout: BatchLayout, inputs: Gaussians, options: BatchOptions
 ) -> tuple[LazyDict, Tensor]:
     """Returns all of meta but means2d, and the means2d, as arranged; see `rasterization`."""
     cameras = [

@@ -67,7 +67,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, eq=False)
-class StepResult:
+class StepOutcome:
     """A training step: the loss, its gradients, and the parameters after one step of Adam."""
 
     loss: float
@@ -82,7 +82,7 @@ class BackendCandidate:
     name: str
     render: Renderer
     # by its own loss and optimizer; leaves the splats alone
-    train_step: Callable[[Splats, Camera, TargetImage, StepOptions], StepResult]
+    train_step: Callable[[Splats, Camera, TargetImage, StepOptions], StepOutcome]
 
 
 def numba_candidate() -> BackendCandidate:
@@ -93,11 +93,11 @@ def numba_candidate() -> BackendCandidate:
 
     def train_step(
         splats: Splats, camera: Camera, target: TargetImage, options: StepOptions
-    ) -> StepResult:
+    ) -> StepOutcome:
         gradients, moved = splats.map(torch.zeros_like), splats.map(torch.clone)
         loss = PhotometricStep()(splats, gradients, camera, target, options)
         adam(*_adam_groups(moved, gradients), count=1, betas=_BETAS, epsilon=_EPSILON)
-        return StepResult(loss, gradients, moved)
+        return StepOutcome(loss, gradients, moved)
 
     return BackendCandidate("numba", render, train_step)
 
@@ -110,7 +110,7 @@ def triton_candidate() -> BackendCandidate:
 
     def train_step(
         splats: Splats, camera: Camera, target: TargetImage, options: StepOptions
-    ) -> StepResult:
+    ) -> StepOutcome:
         gradients, moved = splats.map(torch.zeros_like), splats.map(torch.clone)
         step, steps = PhotometricStep(splats.means.device), 0
         while steps < _REPEATS:
@@ -119,7 +119,7 @@ def triton_candidate() -> BackendCandidate:
             steps += report.stopped is None  # else there is room for it now
         adam(*_adam_groups(moved, gradients), counted=step.counted, betas=_BETAS,
              taken=torch.zeros(1, dtype=torch.int64, device=splats.means.device), epsilon=_EPSILON)
-        return StepResult(report.loss, gradients, moved)
+        return StepOutcome(report.loss, gradients, moved)
 
     return BackendCandidate("triton", render, train_step)
 

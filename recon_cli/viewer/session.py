@@ -27,7 +27,7 @@ from recon_cli.viewer.content import (
     move_browser,
     vertical_fov,
 )
-from recon_cli.viewer.gaussians import PackedSplats, show_backdrop
+from recon_cli.viewer.gaussians import PackedGaussians, show_backdrop
 from recon_cli.viewer.keyframes import LEAST_MOVE, KeyframePanel
 from recon_cli.viewer.measure_panel import MeasurePanel
 from recon_cli.viewer.trust_tint import TrustTint
@@ -80,7 +80,7 @@ class Session:
         self._path.stop()
 
     @property
-    def _packed(self) -> PackedSplats:
+    def _packed(self) -> PackedGaussians:
         return self._content.models[self._model]
 
     def _add_gaussians(self) -> viser.GaussianSplatHandle:

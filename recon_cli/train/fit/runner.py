@@ -28,7 +28,7 @@ CHECKPOINT = "checkpoint.safetensors"
 
 
 @dataclass(frozen=True)
-class Segment:
+class RunSegment:
     """The steps of a run that one stage takes, and the files that they leave."""
 
     out: Path  # partial folder of the stage
@@ -42,7 +42,7 @@ class Segment:
 
 
 def run_fit(
-    state: TrainState, task: Task, until: int, segment: Segment, ctx: StageContext,
+    state: TrainState, task: Task, until: int, segment: RunSegment, ctx: StageContext,
     importance: Importance | None = None,
 ) -> None:
     """Fits until `until` steps, saving the state as it goes.
