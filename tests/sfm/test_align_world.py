@@ -151,7 +151,7 @@ def test_level_panoramas_that_face_one_way_show_up_without_a_floor(tmp_path, mon
         model.add_point3D(place, pycolmap.Track(), np.zeros(3, np.uint8))
     job, _ = make_capture(tmp_path, frames=3)
     write_parts(job, [(model, None)])
-    monkeypatch.setattr(undistort, "check_part", lambda job: None)
+    monkeypatch.setattr(undistort, "check_part", lambda _: None)
     placed = undistort.place_model(job).world
     assert placed.evidence.up_found == found
     up = -Similarity.from_json(placed.similarity).rotation @ world.inv().as_matrix()[:, 1]

@@ -99,7 +99,8 @@ def world_transform(
     evidence = _evidence(up, axis, strength, source, fused)
     return WorldFrame(
         Similarity(scale=fused.scale or 1.0 if fused else 1.0).after(turn), evidence, measured,
-        (*_describe_up(evidence, level_views is not None), *_describe_scale(source, measured, fused)))
+        (*_describe_up(evidence, level_views is not None),
+         *_describe_scale(source, measured, fused)))
 
 
 def refuse_contradiction(evidence: WorldEvidence, *, accepted: bool) -> None:
