@@ -22,12 +22,13 @@ from PIL import ExifTags
 
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.capture.frame_selection import MIN_AUTOMATIC
-from recon_cli.capture.images import WHITE, Photo, open_image, read_gray
+from recon_cli.capture.images import Photo, open_image, read_gray
 from recon_cli.capture.ingested_source import IngestContext
 from recon_cli.capture.lens_border import BorderMeter
 from recon_cli.capture.photos import group_photos
 from recon_cli.capture.scan import Scan
 from recon_cli.capture.strangers import find_strangers
+from recon_cli.capture.tiff import WHITE
 from recon_cli.capture.tracker import Tracker
 from recon_cli.capture.unreadable import BROKEN
 from recon_cli.errors import FormatError, InputError

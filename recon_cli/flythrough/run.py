@@ -23,6 +23,7 @@ from recon_cli.errors import (
     WorkspaceError,
     format_count,
     list_names,
+    name_command,
 )
 from recon_cli.flythrough.camera_path import write_camera_path
 from recon_cli.flythrough.camera_plan import CameraPlan, check_frame_memory, plan_cameras
@@ -56,9 +57,9 @@ from recon_cli.workspace.atomic import (
     write_json,
 )
 from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.journal import crc32
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
 from recon_cli.workspace.records import find_frames
+from recon_cli.workspace.steps import crc32
 
 RECORD = "render.json"
 PATH = "camera_path.json"
@@ -200,8 +201,9 @@ def render_frames(request: RenderRequest, job: Job) -> str:
                 VIDEO_FRAMES[frames.outputs[0]], frames.names[0]), request.out_file)
         files = [request.out_file]
     if request.out_file is not None:
-        logger.info("%s of frames stay in %s to continue from; `recon clean --renders` frees them",
-                    format_megabytes(layout.size_of(frames.root)), frames.root)
+        logger.info("%s of frames stay in %s to continue from; %s frees them",
+                    format_megabytes(layout.size_of(frames.root)), frames.root,
+                    name_command("clean --renders"))
     return "\n".join([
         f"{format_count(len(frames.names), 'frame')} in {frames.root}, {len(missing)} of them "
         "rendered now", *map(str, files)])

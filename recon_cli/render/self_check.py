@@ -29,7 +29,7 @@ from recon_cli.render.contract import Renderer, StepOptions, TargetImage
 from recon_cli.render.response import Response, ResponseTensors
 from recon_cli.render.torch.tiles import render as torch_render
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import TERMS, Splats
 
 logger = logging.getLogger("recon")
 
@@ -42,7 +42,7 @@ _ADAM = 1e-2  # of the learning rate
 _NOT_FINITE = 1e30  # stands for an error that is not finite: JSON has no number for it
 _RATE, _BETAS, _EPSILON = 1e-3, (0.9, 0.999), 1e-15
 _SSIM_WEIGHT = 0.2
-_DEGREE = 3
+_DEGREE = len(TERMS) - 1
 _REPEATS = 4  # of a step: CUDA graphs are recorded at the third time and replayed from then on
 _STATISTICS = "radii", "blend_sum", "means2d_grad", "loo"
 _AdamGroups = tuple[

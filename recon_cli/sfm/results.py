@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from recon_cli.sfm.job import MappingJob, Record, StepLog
+from recon_cli.sfm.job import MappingJob
 from recon_cli.workspace.json_record import KEY, JsonRecord
+from recon_cli.workspace.steps import Record, StepFolder
 from recon_cli.workspace.summaries import AttemptSummary, PosesSummary, WorldSummary
 
 Names = tuple[str, ...]
@@ -122,10 +123,10 @@ class MappingResult:
     @classmethod
     def read(cls, job: MappingJob) -> MappingResult:
         """Returns what the log of a job says, all of whose steps are finished."""
-        log = StepLog(job.out)
+        log = StepFolder(job.out)
 
         def result(step: str, kind: type[Record]) -> Record:
-            found = log.result(step, kind)
+            found = log.find(step, kind)
             assert found is not None, f"the mapping process ended without {step}"
             return found
 

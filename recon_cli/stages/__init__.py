@@ -109,7 +109,7 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 4, True,
           "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json"),
+          ("database.db", "log.txt", "steps.json*", "verdict.json", "segments.json"),
           own_digests=True, late=("part", "gravity", "scale_between")),
     Stage("train", "train", ("ingest", "sfm"), (), TrainConfig, TrainSummary, 5, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"),

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, FormatError, format_count, list_names
+from recon_cli.errors import ConfigError, FormatError, format_count, list_names, name_command
 from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.jobs.executor import Executor, start_executor
 from recon_cli.room.scale import parse_place
 from recon_cli.scene.camera import MODELS, PANORAMA
 from recon_cli.sfm import database
-from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob
 from recon_cli.sfm.mapping import parts, process
 from recon_cli.sfm.mapping.time_estimate import Workload, estimate_for_notice, format_minutes
 from recon_cli.sfm.mapping.trusted_part import JOIN_PANORAMAS
@@ -31,6 +31,7 @@ from recon_cli.workspace.records import (
     describe_stretches,
     read_poses,
 )
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import (
     AttemptSummary,
     PartSummary,
@@ -92,7 +93,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     summary = _summary(frames, runs, MappingResult.read(job))
     _report(summary, frames, ctx)
     segments.remove_segments(job)
-    database.unseal(job.database)
+    database.forget_rows(job.database)
     return summary
 
 
@@ -145,7 +146,7 @@ def _time_limit(config: SfmConfig, frames: FrameList) -> float:
 
 def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
     """Tells how long the cameras will take, and the limit where it is near."""
-    if job.known_poses or job.pairs != "auto" or StepLog(job.out).is_finished("features"):
+    if job.known_poses or job.pairs != "auto" or StepFolder(job.out).is_finished("features"):
         return  # as asked for, or partly done
     mapped = segments.count_mapped(job)
     number = segments.count_segments(mapped, config.segments)
@@ -198,7 +199,7 @@ def _check_frames(job: MappingJob) -> None:
         if missing:
             raise FormatError(
                 f"{folder} lacks {len(missing)} of {len(job.names)} frames: {list_names(missing)}.",
-                hint=f"Run `recon {verb} --again`.")
+                hint=f"Run {name_command(f'{verb} --again')}.")
 
 
 def _summary(frames: FrameList, runs: segments.SegmentRuns, found: MappingResult) -> SfmSummary:
@@ -237,8 +238,8 @@ def _report(summary: SfmSummary, frames: FrameList, ctx: StageContext) -> None:
             ctx.notice(sentence)
     if sound and summary.rough:
         ctx.notice(f"{len(summary.rough)} of {summary.registered} cameras are rough, known badly "
-                   f"for too few points in common: {list_names(summary.rough)}; `recon report` "
-                   "says how badly.")
+                   f"for too few points in common: {list_names(summary.rough)}; "
+                   f"{name_command('report')} says how badly.")
     for sentence in (*_describe_parts(summary, frames),
                      *_describe_left_out(summary, frames, named=not sound)):
         ctx.notice(sentence)
@@ -279,8 +280,8 @@ def _describe_parts(summary: SfmSummary, frames: FrameList) -> Iterator[str]:
         yield (f"Part {number} has {len(part.names)} of {summary.frames} frames: "
                f"{_stretches(frames, part.names)}.")
     other = 2 if summary.part == 1 else 1
-    yield (f"`recon sfm --part {other}` takes part {other}, without mapping again; `recon report` "
-           "shows what to film to join them.")
+    yield (f"{name_command(f'sfm --part {other}')} takes part {other}, without mapping again; "
+           f"{name_command('report')} shows what to film to join them.")
 
 
 def _describe_left_out(
@@ -299,7 +300,7 @@ def _describe_left_out(
         yield f"{name} was taken out of the model: {reason}."
     if missing and not (named and summary.lines):
         yield (f"Left out without a camera: {len(missing)} of {summary.frames} frames, "
-               f"{_stretches(frames, missing)}; `recon report` says why.")
+               f"{_stretches(frames, missing)}; {name_command('report')} says why.")
     if missing and any(group.lens is not None and group.lens.is_panorama
                        for group in frames.groups):
         yield JOIN_PANORAMAS

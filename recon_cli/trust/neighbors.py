@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render.contract import NEAR
+from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.trust.support import Support
@@ -83,9 +84,8 @@ def support_of_all(
 
 def _in_frame(means: Tensor, radii: Tensor, camera: Camera) -> Tensor:
     """Returns which of K balls the frame of a camera touches, [K] bool."""
-    pose = torch.as_tensor(camera.viewmat, dtype=means.dtype, device=means.device)
-    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    pixels, z = TensorCamera.from_camera(camera, means).project(means)
+    u, v = pixels.unbind(1)
     wide, high = camera.fx * radii / z, camera.fy * radii / z
     return ((z > NEAR) & (u >= -wide) & (u < camera.width + wide)
             & (v >= -high) & (v < camera.height + high))

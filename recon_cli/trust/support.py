@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.render import render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -152,7 +152,7 @@ class Support:
             bits = np.unpackbits(shown.numpy(), axis=1, count=count)
         except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
             raise FormatError(
-                f"{path} cannot be read: {error}.", hint="Run `recon eval --again`.") from error
+                f"{path} cannot be read: {error}.", hint=Hint("eval", again=True)) from error
         rows = tuple(torch.from_numpy(np.nonzero(row)[0]) for row in bits)
         return Support.from_rows(rows, centers.numpy(), residual, str(head["digest"]))
 
@@ -225,10 +225,7 @@ def error_image(
 
 def _pixels(means: Tensor, view: TrainView) -> tuple[Tensor, Tensor]:
     """Returns line and column [K] of the pixels that centres [K, 3] fall on, on the CPU."""
-    camera = view.camera
-    local = means.detach().cpu().double().numpy() @ camera.viewmat[:3, :3].T + (
-        camera.viewmat[:3, 3])
-    depth = np.maximum(local[:, 2], 1e-9)
-    u = np.floor(camera.fx * local[:, 0] / depth + camera.cx).clip(0, camera.width - 1)
-    v = np.floor(camera.fy * local[:, 1] / depth + camera.cy).clip(0, camera.height - 1)
-    return torch.from_numpy(v.astype(np.int64)), torch.from_numpy(u.astype(np.int64))
+    pixels, _ = view.camera.project(means.detach().cpu().double().numpy())
+    last = view.camera.width - 1, view.camera.height - 1
+    column, line = torch.from_numpy(np.nan_to_num(pixels).clip(0, last)).long().unbind(1)
+    return line, column

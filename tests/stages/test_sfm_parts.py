@@ -15,9 +15,9 @@ from recon_cli.context import EarlierResult, StageContext, StageInputs
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images
 from recon_cli.sfm import database
-from recon_cli.sfm.job import StepLog
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.stages import sfm
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import SfmSummary
 
 # Two walks along two walls that have nothing in common.
@@ -39,8 +39,8 @@ def base(tmp_path_factory):
 def matched(out):
     """Leaves what a run leaves that was killed after it had matched the frames."""
     out.mkdir(parents=True)
-    database.seal(MADE.write_database(out / "database.db"))
-    log = StepLog(out)
+    database.record_rows(MADE.write_database(out / "database.db"))
+    log = StepFolder(out)
     log.finish("features", FeaturesResult(rows=0, keypoints=0, seconds=3.0, cpu_seconds=2.0))
     log.finish("matches", MatchesResult(
         rows=0, verified_pairs=0, matches=0, seconds=3.0, cpu_seconds=2.0))
@@ -116,7 +116,7 @@ def test_the_other_part_is_taken_without_mapping_again(mapped, base, tmp_path):
 def test_axes_are_chosen_anew_without_mapping_again(mapped, base, tmp_path):
     taken = run(base, tmp_path / "out", earlier=result_of(mapped), gravity="off")
     assert taken.seconds["model"] == mapped[1].seconds["model"]
-    assert StepLog(tmp_path / "out").result("model", ModelResult).earlier is not None
+    assert StepFolder(tmp_path / "out").find("model", ModelResult).earlier is not None
     assert not taken.world.evidence.up_found
 
 
@@ -143,11 +143,11 @@ def test_a_run_that_was_killed_while_it_took_the_parts_takes_them_again(mapped, 
 @pytest.mark.parametrize("lost", [
     {"changed": frozenset({"parts/2/points3D.bin"})},
     *(pytest.param(lost, marks=pytest.mark.slow) for lost in (
-        {"missing": frozenset({"parts/1/rigs.bin"})}, {"changed": frozenset({"steps.json"})}))])
+        {"missing": frozenset({"parts/1/rigs.bin"})}, {"changed": frozenset({"steps.jsonl"})}))])
 def test_parts_that_were_changed_are_not_taken(mapped, base, tmp_path, lost):
     out = matched(tmp_path / "out")
     run(base, out, earlier=result_of(mapped, **lost), part=2)  # maps by itself
-    assert StepLog(out).result("model", ModelResult).earlier is None
+    assert StepFolder(out).find("model", ModelResult).earlier is None
     assert placed(out) == PARTS[1]
 
 

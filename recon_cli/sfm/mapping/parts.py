@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from recon_cli.errors import ConfigError, ManifestError
+from recon_cli.errors import ConfigError, ManifestError, name_command
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm.job import (
     DATABASE,
-    LOG_FILE,
+    ORDER,
     VERDICT,
     MappingJob,
-    StepLog,
     fresh_folder,
     publish,
 )
@@ -28,6 +27,7 @@ from recon_cli.sfm.mapping import mapper
 from recon_cli.sfm.results import EarlierRun, ModelResult, PartResult
 from recon_cli.sfm.verdict.verdict import ModelVerdict
 from recon_cli.workspace import atomic, layout
+from recon_cli.workspace.steps import LOG, StepFolder
 from recon_cli.workspace.summaries import SfmSummary
 
 
@@ -69,7 +69,7 @@ def describe_part(
 
 def check_part(job: MappingJob) -> None:
     """Raises ConfigError where the capture has no part of the job's number."""
-    found = StepLog(job.out).result("model", ModelResult)
+    found = StepFolder(job.out).find("model", ModelResult)
     assert found is not None, "the parts are found before one of them is placed"
     sizes = [len(part.registered) for part in found.parts]
     if job.part <= len(sizes):
@@ -77,7 +77,8 @@ def check_part(job: MappingJob) -> None:
     named = ", ".join(f"{number} of {size} frames" for number, size in enumerate(sizes, 1))
     raise ConfigError(
         f"part is {job.part}, but the capture has {len(sizes)}: {named}.",
-        hint=f"Type `recon sfm --part {len(sizes)}`{' or a smaller number' * (len(sizes) > 1)}.")
+        hint="Type "
+        f"{name_command(f'sfm --part {len(sizes)}')}{' or a smaller number' * (len(sizes) > 1)}.")
 
 
 def take_over(
@@ -92,10 +93,10 @@ def take_over(
         known = SfmSummary.from_json(summary)
     except ManifestError:  # of another version
         return False
-    log, current = StepLog(finished), StepLog(out).result("model", ModelResult)
-    found = log.result("model", ModelResult)
+    log, current = StepFolder(finished), StepFolder(out).find("model", ModelResult)
+    found = log.find("model", ModelResult)
     needed = log.files("model")
-    intact = set(touched).isdisjoint((*needed, LOG_FILE))
+    intact = set(touched).isdisjoint((*needed, LOG))
     if found is None or not (known.parts and intact):
         return False
     if current is not None and current.earlier is not None:  # of an interrupted run
@@ -105,6 +106,8 @@ def take_over(
     for name in (*needed, DATABASE):
         if (finished / name).is_file():
             layout.link_or_copy(finished / name, out / name)
-    log.copy_to(out, "model", dataclasses.replace(found, earlier=EarlierRun(
-        segments=known.segments, cpu_seconds=known.cpu_seconds or {})))
+    log.copy_to(out, ORDER[:ORDER.index("model")])
+    StepFolder(out).finish("model", dataclasses.replace(found, earlier=EarlierRun(
+        segments=known.segments, cpu_seconds=known.cpu_seconds or {})), [
+            out / name for name in needed])
     return True

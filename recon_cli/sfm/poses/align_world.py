@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import SfmError
-from recon_cli.io.colmap import Pinhole
+from recon_cli.errors import SfmError, name_command
 from recon_cli.room.scale import (
     ARBITRARY,
     DATA_SET,
@@ -34,6 +33,7 @@ from recon_cli.room.scale_fusion import (
     fuse,
     fuse_measured,
 )
+from recon_cli.scene.camera import Lens
 from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
@@ -66,7 +66,7 @@ def world_transform(
     metric: bool,  # the mapper's units are metres, as in a data set with measured poses
     sources: Sequence[ScaleSource] = (),  # what else tells the scale, in the order of trust
     given_up: tuple[float, float, float] | None = None,  # unit vector that a data set knows
-    pinholes: Mapping[str, Pinhole] | None = None,  # of undistorted frames, for FRAME:u,v
+    pinholes: Mapping[str, Lens] | None = None,  # of undistorted frames, for FRAME:u,v
 ) -> WorldFrame:
     """Returns the world frame of a model.
 
@@ -111,7 +111,7 @@ def refuse_contradiction(evidence: WorldEvidence, *, accepted: bool) -> None:
     raise SfmError(
         f"What tells the scale contradicts itself, so that no length would be right: {told}.",
         hint="Name a length that you measured with --scale-between A B METRES; or type "
-        "`recon sfm --accept-weak` for a scene in an arbitrary scale.")
+        f"{name_command('sfm --accept-weak')} for a scene in an arbitrary scale.")
 
 
 def _name_source(fused: FusedScale | None) -> str:

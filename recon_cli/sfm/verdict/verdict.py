@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import SfmError, format_count, list_names
+from recon_cli.errors import SfmError, format_count, list_names, name_command
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.sphere import is_panorama
 from recon_cli.sfm.features.still_points import MAX_STILL, find_still_share
@@ -256,8 +256,8 @@ def check_weak_link(verdict: ModelVerdict, accept: bool, *, given: bool = False)
             "--accept-weak."))
     raise SfmError(
         " ".join(problems),
-        hint="Use more frames between the two parts (`recon ingest --frames N`), match all of them "
-        "(--pairs exhaustive), or keep the model as it is with --accept-weak.")
+        hint=f"Use more frames between the two parts ({name_command('ingest --frames N')}), match "
+        "all of them (--pairs exhaustive), or keep the model as it is with --accept-weak.")
 
 
 def _parts(names: Sequence[str], weights: view_graph.Weights) -> tuple[Names, ...]:

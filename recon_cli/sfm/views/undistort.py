@@ -19,15 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import format_count
-from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.io.training_scene import held_out_names
 from recon_cli.room.scale import ScaleBetween
+from recon_cli.scene.camera import Lens
 from recon_cli.scene.faces import is_cube_face, view_name
 from recon_cli.sfm.features.sphere import is_panorama
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.mapping.parts import check_part
+from recon_cli.sfm.model_arrays import registered_images, viewmat_of
 from recon_cli.sfm.poses.align_world import refuse_contradiction, world_transform
 from recon_cli.sfm.poses.depth_points import add_depth_points
 from recon_cli.sfm.poses.scale_evidence import ask_device
@@ -59,9 +60,8 @@ def place_model(job: MappingJob) -> PlacedResult:
     check_part(job)
     part = job.parts / str(job.part)
     model = pycolmap.Reconstruction(part)
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    viewmats = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-                for name, image in images.items()}
+    images = {image.name: image for image in registered_images(model)}
+    viewmats = {name: viewmat_of(image) for name, image in images.items()}
     device = ask_device(job, model, viewmats)
     if device.depth_scale is not None and job.pose_use != "keep" and job.poses is not None:
         ingest = job.poses.parent
@@ -106,16 +106,16 @@ def _level_views(
         aside @ viewmats[image.name] for image in images if is_panorama(image.camera))])
 
 
-def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+def _pinhole(camera: pycolmap.Camera) -> Lens:
     """Returns the camera of the undistorted image, to whose pixels --scale-between may point."""
     flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    return Pinhole(flat.width, flat.height, *flat.params)
+    return Lens("PINHOLE", flat.width, flat.height, tuple(flat.params))
 
 
 def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
     """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
     model = pycolmap.Reconstruction(job.out / SPARSE)
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    images = {image.name: image for image in registered_images(model)}
     names = sorted(images)
     report.phase("undistorted", len(names))
     work = fresh_folder(job.out / "undistorted.partial")
@@ -148,7 +148,7 @@ def undistort(job: MappingJob, report: Reporter) -> UndistortedResult:
     with ThreadPoolExecutor(job.threads) as pool:
         for count, _ in enumerate(pool.map(write, names), 1):
             report.done(count)
-    counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
+    counts = Counter(image.camera_id for image in registered_images(flat))
     cameras = tuple(
         {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
          "frames": counts[index]}

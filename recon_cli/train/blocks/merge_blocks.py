@@ -19,7 +19,7 @@ import torch
 
 from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import FormatError, ReconstructionError
+from recon_cli.errors import FormatError, ReconstructionError, name_command
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.evaluation.reference_views import load_reference_views, render_view
 from recon_cli.io.images import fit_camera
@@ -89,7 +89,7 @@ def merge_blocks(
     if not len(splats):
         raise ReconstructionError(
             "No block has a Gaussian in its cell.",
-            hint="Train one model by `recon train --blocks off`.")
+            hint=f"Train one model by {name_command('train --blocks off')}.")
     before = sum(block.summary.iterations for block in blocks)
     steps = round(_FINETUNE * before)
     config = dataclasses.replace(

@@ -19,7 +19,7 @@ from recon_cli.train.fit.importance import Importance
 from recon_cli.train.fit.loop import fit
 from recon_cli.train.fit.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
 from recon_cli.train.fit.task import Task
-from recon_cli.workspace import journal
+from recon_cli.workspace import steps
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.summaries import LogRow
 
@@ -113,7 +113,7 @@ class TrainLog(TrainCallback):
 
     def keep(self) -> None:
         """Records the log up to here, for a later run that continues from here."""
-        journal.expect_growth(self._path)
+        steps.expect_growth(self._path)
 
     def _write(self, row: LogRow) -> None:
         row = dataclasses.replace(
