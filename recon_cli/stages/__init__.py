@@ -107,7 +107,7 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.ingest", input_metavar="VIDEO"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 4, True,
           "recon_cli.stages.denoise"),
-    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 4, True,
+    Stage("sfm", "sfm", ("ingest", "denoise"), (), SfmConfig, SfmSummary, 5, True,
           "recon_cli.stages.sfm",
           ("database.db", "log.txt", "steps.json*", "verdict.json", "segments.json"),
           own_digests=True, late=("part", "gravity", "scale_between")),

@@ -14,6 +14,7 @@ from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import database
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import (
+    FEW_LOSS_SCALE,
     LOSS_SCALE,
     MAX_ERROR_PX,
     MIN_FRAMES,
@@ -143,11 +144,12 @@ def adjust(
     """Adjusts a model in place with the principal point free; drops points that got lost.
 
     All images together determine it: on the fox photos it comes out 2 px from the published value,
-    16 px off the middle. The intrinsics of the cameras `constant` stay as they are. Errors count
-    squared, or by Cauchy's loss from `loss_scale` pixels on.
+    16 px off the middle. Few do not, and it stays where it is. The intrinsics of the cameras
+    `constant` stay as they are. Errors count squared, or by Cauchy's loss from `loss_scale` pixels
+    on.
     """
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = True
+    options.refine_principal_point = model.num_reg_images() >= MIN_IMAGES_PRINCIPAL
     options.print_summary = False
     options.ceres.solver_options.num_threads = THREADS
     options.ceres.solver_options.function_tolerance = TOLERANCE
@@ -217,7 +219,8 @@ def sharpen(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     if any(sharp.image(i).num_points3D < KEPT_SHARE * model.image(i).num_points3D
            for i in model.reg_image_ids()):
         sharp = pycolmap.Reconstruction(model)
-    adjust(sharp, loss_scale=LOSS_SCALE * error)
+    few = model.num_reg_images() < MIN_IMAGES_PRINCIPAL
+    adjust(sharp, loss_scale=(FEW_LOSS_SCALE if few else LOSS_SCALE) * error)
     return sharp
 
 

@@ -60,7 +60,8 @@ def world_transform(
     points: NDArray[np.float64],  # [P, 3] sparse points in the mapper's frame
     viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera of each frame
     *,
-    gravity: bool,  # find up; False leaves the axes and the origin
+    # [C, 4, 4] views whose x axes are held level, to find up by; None leaves axes and origin
+    level_views: NDArray[np.float64] | None,
     scale_between: ScaleBetween | None,
     metric: bool,  # the mapper's units are metres, as in a data set with measured poses
     sources: Sequence[ScaleSource] = (),  # what else tells the scale, in the order of trust
@@ -76,10 +77,10 @@ def world_transform(
     """
     names = sorted(viewmats)
     matrices = np.array([viewmats[name] for name in names]).reshape(-1, 4, 4)
-    up = (find_gravity(points, matrices) if gravity and given_up is None
+    up = (find_gravity(points, level_views) if level_views is not None and given_up is None
           else Gravity(None, None, None, "it was not looked for"))
     turn, axis, strength = Similarity(), "mapper", None
-    if gravity and given_up is not None:
+    if level_views is not None and given_up is not None:
         given = np.array(given_up)
         up = Gravity(given, None, None)
         turn, axis = Similarity(rotation=turn_onto(given, np.array([0.0, 0.0, 1.0]))), "data set"
@@ -98,7 +99,8 @@ def world_transform(
     evidence = _evidence(up, axis, strength, source, fused)
     return WorldFrame(
         Similarity(scale=fused.scale or 1.0 if fused else 1.0).after(turn), evidence, measured,
-        (*_describe_up(evidence, gravity), *_describe_scale(source, measured, fused)))
+        (*_describe_up(evidence, level_views is not None),
+         *_describe_scale(source, measured, fused)))
 
 
 def refuse_contradiction(evidence: WorldEvidence, *, accepted: bool) -> None:

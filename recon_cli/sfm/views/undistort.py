@@ -10,7 +10,7 @@ import dataclasses
 import filecmp
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial, reduce
 from pathlib import Path
@@ -25,6 +25,7 @@ from recon_cli.io.training_scene import held_out_names
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.scene.camera import Lens
 from recon_cli.scene.faces import is_cube_face, view_name
+from recon_cli.sfm.features.sphere import is_panorama
 from recon_cli.sfm.job import VERDICT, MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.mapping.parts import check_part
 from recon_cli.sfm.model_arrays import registered_images, viewmat_of
@@ -69,7 +70,8 @@ def place_model(job: MappingJob) -> PlacedResult:
     several = {number for number, camera in model.cameras.items() if has_faces(camera)}
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,
-        gravity=job.gravity and device.axes_open, given_up=device.up,
+        level_views=_level_views(images.values(), viewmats) if (
+            job.gravity and device.axes_open) else None, given_up=device.up,
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
         metric=device.metric, sources=device.sources,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()
@@ -90,6 +92,18 @@ def place_model(job: MappingJob) -> PlacedResult:
     if verdict:
         atomic.write_json(job.out / VERDICT, verdict)
     return PlacedResult(world=summary)
+
+
+def _level_views(
+    images: Iterable[pycolmap.Image], viewmats: Mapping[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:  # [C, 4, 4]
+    """Returns the views whose x axes are held level: those of cameras, and two of each panorama.
+
+    A tripod, or the camera itself, levels a panorama all around: also a quarter turn further on.
+    """
+    aside = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    return np.array([*viewmats.values(), *(
+        aside @ viewmats[image.name] for image in images if is_panorama(image.camera))])
 
 
 def _pinhole(camera: pycolmap.Camera) -> Lens:
