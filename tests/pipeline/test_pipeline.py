@@ -64,9 +64,9 @@ def test_the_command_to_type_is_one_that_the_shell_and_the_verb_take(job: Job) -
     changes = {"sfm": {"scale_between": ("my frame.png", "b.png", 1.5)}, "denoise": {"mode": "off"}}
     bring(job, "denoise", "sfm", changes=changes)
     look = job.inspect()
-    assert plan.command(look, look.check("denoise")) == "recon denoise --off"
+    assert plan.command(look, look.check("denoise")) == "denoise --off"
     assert plan.command(look, look.check("sfm")) == (
-        "recon sfm --scale-between 'my frame.png' b.png 1.5")
+        "sfm --scale-between 'my frame.png' b.png 1.5")
 
 
 def test_a_stage_keeps_the_options_it_was_made_with_when_others_need_it(job: Job) -> None:

@@ -4,10 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 from synthetic import center_error, make_capture, part
-from test_camera_covariance import converging, noisy
 
 from recon_cli.sfm.job import Reporter
-from recon_cli.sfm.limits import MIN_IMAGES_PRINCIPAL
 from recon_cli.sfm.mapping import mapper, merge_models
 from recon_cli.sfm.mapping.mapper import triangulation_angles
 
@@ -184,13 +182,3 @@ def test_points_are_refined_until_the_cameras_settle(tmp_path):
     assert center_error(model, truth) < 1e-3
     assert model.camera(1).params[2] == pytest.approx(512, abs=0.1)
     assert model.compute_mean_reprojection_error() < 0.01
-
-
-@pytest.mark.parametrize("count", [MIN_IMAGES_PRINCIPAL - 1, MIN_IMAGES_PRINCIPAL])
-def test_few_images_do_not_move_the_principal_point(count):
-    model = noisy(converging(count=count), 0)
-    camera, = model.cameras.values()
-    before = camera.principal_point_x, camera.focal_length_x
-    mapper.adjust(model)
-    assert (camera.principal_point_x != before[0]) == (count == MIN_IMAGES_PRINCIPAL)
-    assert camera.focal_length_x != before[1]

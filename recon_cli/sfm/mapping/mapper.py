@@ -144,12 +144,11 @@ def adjust(
     """Adjusts a model in place with the principal point free; drops points that got lost.
 
     All images together determine it: on the fox photos it comes out 2 px from the published value,
-    16 px off the middle. Few do not, and it stays where it is. The intrinsics of the cameras
-    `constant` stay as they are. Errors count squared, or by Cauchy's loss from `loss_scale` pixels
-    on.
+    16 px off the middle. The intrinsics of the cameras `constant` stay as they are. Errors count
+    squared, or by Cauchy's loss from `loss_scale` pixels on.
     """
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = model.num_reg_images() >= MIN_IMAGES_PRINCIPAL
+    options.refine_principal_point = True
     options.print_summary = False
     options.ceres.solver_options.num_threads = THREADS
     options.ceres.solver_options.function_tolerance = TOLERANCE
