@@ -8,7 +8,7 @@ import os
 import sys
 import time
 from collections import UserDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,17 @@ from typing import Any
 import click
 
 from recon_cli import __version__, machine, signals
-from recon_cli.commands import console, hints
+from recon_cli.commands import console, usage
 from recon_cli.commands.console import Failure, Log
 from recon_cli.commands.options import Call, complete, used_variables
-from recon_cli.errors import ExitCode, ReconError, WorkspaceError
+from recon_cli.errors import (
+    IN_USE,
+    WITHOUT_WORKSPACE,
+    ExitCode,
+    ReconError,
+    WorkspaceError,
+    use_workspace,
+)
 from recon_cli.workspace import disk
 from recon_cli.workspace.paths import is_address
 
@@ -100,8 +107,8 @@ class _LazyGroup(click.Group):
         except click.UsageError as error:
             if not (Path(args[0]).suffix or os.path.lexists(args[0]) or is_address(args[0])):
                 raise
-            raise console.HintedUsageError(
-                f"{args[0]} is not a command.", hint=hints.suggest_command("", args)) from error
+            raise usage.HintedUsageError(
+                f"{args[0]} is not a command.", hint=usage.suggest_command("", args)) from error
 
     def list_commands(self, _ctx: click.Context) -> list[str]:
         """Returns the verbs."""
@@ -122,28 +129,14 @@ def cli() -> None:
     """Turn a video or photos of a room into a 3D Gaussian Splatting scene."""
 
 
-def _default_workspace(verb: str) -> str | None:
-    """Returns the workspace that a verb takes where none is typed; None where it takes none."""
-    command = cli.commands.get(verb) if verb in VERBS else None
-    option = next((item for item in command.params if item.name == "workspace"), None) if (
-        command) else None
-    if not isinstance(option, click.Option):
-        return None
-    given = os.environ.get(str(option.envvar)) if option.envvar else None
-    return given or str(option.default)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command line and returns its exit code."""
     words, begin = list(sys.argv[1:] if arguments is None else arguments), time.monotonic()
     call = Call()
-
-    def complete_commands(text: str) -> str:
-        return hints.name_workspace(
-            hints.name_verb(text, _verb(words)), call.workspace, _default_workspace)
-
-    with console.show_log(call, complete=complete_commands) as log:
-        failure, code = None, int(ExitCode.DONE)
+    if _verb(words):  # a command that recon types itself inherits what was typed
+        use_workspace(_verb(words), None)
+    with console.show_log(call) as log:
+        failure, code, ended = None, int(ExitCode.DONE), None
         error: BaseException | None = None
         try:
             with signals.raising():
@@ -153,14 +146,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             error = (raised.__cause__ if isinstance(raised, _PastClick) else None) or raised
             code = _exit_code(error)
             with suppress(OSError):  # of a stderr that nobody reads, or on the disk that is full
-                failure = _tell(error, log, _verb(words), complete_commands)
-        if call.as_object or (failure and _asks_for_object(error, words)):
-            lines = call.output.lines if call.output else []
-            known = call.as_object and _default_workspace(_verb(words))
+                failure = _tell(error, log, _verb(words))
+        # click returns the code 0 of --help, and nothing from a verb
+        if (call.as_object and ended is None) or (failure and _asks_for_object(error, words)):
+            known = call.as_object and _verb(words) not in ("", *WITHOUT_WORKSPACE)
             code = _print_object(console.result_object(
-                _verb(words), str(call.workspace.absolute()) if known else None, log, lines,
+                _verb(words), str(call.workspace.absolute()) if known else None, log, call.output,
                 time.monotonic() - begin, failure), code)
         console.drop_output()
+        os.environ.pop(IN_USE, None)
         return code
 
 
@@ -188,10 +182,8 @@ def _print_object(text: str, code: int) -> int:
     return code
 
 
-def _tell(
-    error: BaseException, log: Log, verb: str, complete_commands: Callable[[str], str]
-) -> Failure | None:
-    """Prints why a command failed, its hint completed, and returns it; None where nobody reads."""
+def _tell(error: BaseException, log: Log, verb: str) -> Failure | None:
+    """Prints why a command failed and returns it; None where nobody reads."""
     code = _exit_code(error)
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         error.show()
@@ -203,11 +195,11 @@ def _tell(
         log.fail(failure, prefix="")
         return failure
     if isinstance(error, click.ClickException):
-        message, hint = error.format_message(), console.usage_hint(error)
+        message, hint = error.format_message(), usage.usage_hint(error)
     else:
         logger.debug("failed", exc_info=error)
         known = _known(error)
-        message, hint = (known.message, complete_commands(known.hint)) if known else (
+        message, hint = (known.message, known.hint) if known else (
             f"{type(error).__name__}: {error}",
             "This is a bug in recon. Run the command again with -v and report its output.")
     if code == ExitCode.USAGE:

@@ -17,7 +17,7 @@ from typing import IO
 SAFE_PATH = "PYTHONSAFEPATH"
 CHILD = "RECON_JOB"  # environment variable of a command that ends with the one that started it
 # Variables that a child keeps; those of options are the parent's, which types what a child needs.
-_KEPT = ("RECON_CACHE_DIR", "RECON_GPU", "RECON_RUN_BY_RAY", "RECON_WORKSPACE")
+_KEPT = ("RECON_IN_USE", "RECON_CACHE_DIR", "RECON_GPU", "RECON_RUN_BY_RAY", "RECON_WORKSPACE")
 # Of Windows, where a session is a group of processes; elsewhere the flag is 0.
 _OWN_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 _END: int = getattr(signal, "CTRL_BREAK_EVENT", signal.SIGTERM)

@@ -62,7 +62,7 @@ HOMES = {
     "click": {"cli", "commands"},
     "zstandard": {"splats"},
     "jinja2": {"report"},
-    "markupsafe": {"report"},
+    "markupsafe": {"io", "report", "room"},
     "viser": {"viewer"},
     "websockets": {"viewer"},
     "matplotlib": {"experiments"},

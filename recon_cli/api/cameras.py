@@ -109,9 +109,9 @@ def read_cameras(path: str | Path, *, ignore_distortion: bool = False) -> dict[s
         raise InputError(
             f"{len(distorted)} of {len(listed)} cameras in {path} have lens distortion: "
             f"{list_names(distorted)}.",
-            hint="Undistort the images (`recon ingest` and `recon sfm` do, and so does COLMAP's "
+            hint="Undistort the images (ingest and sfm of recon do, and so does COLMAP's "
             "image_undistorter), or pass ignore_distortion=True for the pinhole part alone.")
-    return {name: _pinhole(lens, viewmat) for name, lens, viewmat in listed}
+    return {name: lens.pinhole(viewmat) for name, lens, viewmat in listed}
 
 
 def _list_cameras(path: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
@@ -128,12 +128,6 @@ def _is_distorted(lens: Lens) -> bool:
     focals, _ = MODELS[lens.model]
     # a fisheye is no pinhole even where its coefficients are zero
     return "FISHEYE" in lens.model or any(lens.params[focals + 2:])
-
-
-def _pinhole(lens: Lens, viewmat: NDArray[np.float64]) -> Camera:
-    focals, _ = MODELS[lens.model]
-    cx, cy = lens.params[focals:focals + 2]
-    return Camera(lens.width, lens.height, lens.params[0], lens.params[focals - 1], cx, cy, viewmat)
 
 
 def _read_intrinsics(K: Any) -> tuple[float, float, float, float]:

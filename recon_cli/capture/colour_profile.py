@@ -26,9 +26,6 @@ from recon_cli.capture.video_colour import ADOBE_RGB, PRIMARIES, TRANSFERS, WIDE
 # Profiles of sRGB by several makers differ by rounding; Display P3 differs by up to 60 of 255.
 _SAME = 2
 _FLAGS = ImageCms.Flags.BLACKPOINTCOMPENSATION
-_UNCALIBRATED, _ADOBE_SPACE = 0xFFFF, 2  # EXIF 2.32, ColorSpace; 2 is not in it, but is written
-_ADOBE_INDEX = "R03"  # DCF 2.0: the interoperability index of its option file
-_PNG_HEAD, _PROFILE_HEAD = 8, 128  # bytes before the chunks, and before the table of an ICC profile
 
 
 class Coding(NamedTuple):
@@ -65,8 +62,9 @@ def read_coding(path: Path, image: Image.Image) -> Coding | None:
     index = None
     with suppress(KeyError):  # Pillow 11.1 raises it where there is no such directory
         index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)
+    # DCF 2.0: uncalibrated, and the index of its option file; 2 is not in EXIF 2.32, but is written
     if not image.info.get("icc_profile") and image.mode in ("RGB", "RGBA") and (
-            space == _ADOBE_SPACE or (space == _UNCALIBRATED and index == _ADOBE_INDEX)):
+            space == 2 or (space, index) == (0xFFFF, "R03")):
         return Coding(ADOBE_RGB, None)
     return None
 
@@ -89,9 +87,9 @@ def _codes(path: Path, image: Image.Image) -> Iterator[tuple[int, int]]:
     profile = image.info.get("icc_profile")
     if isinstance(profile, bytes):
         with suppress(struct.error):  # it ends too soon
-            count, = struct.unpack_from(">I", profile, _PROFILE_HEAD)
+            count, = struct.unpack_from(">I", profile, 128)  # its header comes before the table
             for at in range(min(count, len(profile) // 12)):
-                name, start = struct.unpack_from(">4sI", profile, _PROFILE_HEAD + 4 + 12 * at)
+                name, start = struct.unpack_from(">4sI", profile, 132 + 12 * at)
                 if name == b"cicp":  # ICC.1:2022, 9.2.17
                     yield struct.unpack_from("2B", profile, start + 8)
     if image.format == "PNG":
@@ -105,7 +103,7 @@ def _codes(path: Path, image: Image.Image) -> Iterator[tuple[int, int]]:
 def _png_codes(path: Path) -> Iterator[tuple[int, int]]:
     """Yields the codes of a PNG's chunk cICP."""
     with path.open("rb") as file:
-        file.seek(_PNG_HEAD)
+        file.seek(8)  # what every PNG begins with
         while len(head := file.read(8)) == 8:
             length, kind = struct.unpack(">I4s", head)
             if kind == b"cICP":

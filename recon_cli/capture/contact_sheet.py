@@ -28,7 +28,8 @@ MAX_WIDTH = 2000  # pixels; two sheets side by side on a large screen
 THUMB_PIXELS = 14_000  # 158x89 at 16:9
 # Kept frames get at most this share of the cells, to leave room for dropped ones.
 KEPT_SHARE = 0.65
-BORDER, GAP, LINE, TEXT = 4, 6, 15, 12  # pixels
+TEXT = 12  # pixels
+BORDER, GAP, LINE = TEXT // 3, TEXT // 2, TEXT * 5 // 4
 CELL_WIDTH = 118  # at least, for the caption
 HELD_OUT = "held out"
 

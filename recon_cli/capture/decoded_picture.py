@@ -21,20 +21,27 @@ import cv2
 import numpy as np
 from av.buffer import Buffer
 from av.filter import Graph
-from av.video.reformatter import ColorRange, Colorspace, Interpolation
+from av.video.reformatter import (
+    ColorPrimaries,
+    ColorRange,
+    Colorspace,
+    ColorTrc,
+    Interpolation,
+)
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from recon_cli.capture.limits import SAME_SHAPE
 from recon_cli.capture.video_colour import (
     BT2020,
     TRANSFERS,
     WIDE_GAMUTS,
     Transfer,
+    full_range_white,
     gray_table,
     to_srgb,
 )
 
-UNSPECIFIED, RESERVED = 2, 3  # codes of H.273
 # Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
 SD_WIDTH, SD_HEIGHT = 1280, 576
 # Without these, swscale truncates, and repeats chroma instead of interpolating it. Frames of a
@@ -42,8 +49,7 @@ SD_WIDTH, SD_HEIGHT = 1280, 576
 ROUNDED = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 # Planes: with these flags packed RGB of 16 bits (rgb48le) is garbage for 4:2:0 (swscale 9.5).
 DEEP = "gbrp16le"
-# swscale's white at 16 bits of limited range (255 * 256), and of full range as far as 8 bits go.
-WHITE = 65280
+WHITE = full_range_white(8)  # swscale's at 16 bits, of limited range too
 # H.273, table 4: how RGB became YCbCr. swscale converts RGB itself (0), BT.709, FCC, BT.601 (5 and
 # 6), SMPTE 240M and BT.2020; these it refuses.
 UNSUPPORTED_MATRICES = {
@@ -52,11 +58,8 @@ UNSUPPORTED_MATRICES = {
     15: "IPT-PQ-C2", 16: "YCgCo-Re", 17: "YCgCo-Ro"}
 # One frame per frame, not per field: the rows of the first field stay as recorded.
 BWDIF = "mode=send_frame:parity=auto:deint=interlaced"
-LOGARITHMIC = (9, 10)  # H.273, table 3: over a range of 100:1 and 316:1
-INVERTED = 1  # libavutil/stereo3d.h: the view of the right eye comes first
+_UNTAGGED = (ColorTrc.UNSPECIFIED, 3)  # codes of H.273 for primaries, curves and matrices
 USUAL_SHAPE = 16 / 9  # of the view of one eye
-# Frames of another size, scaled in parts of whole pixels, keep the shape of a picture this well.
-SAME_SHAPE = 0.02
 
 
 @dataclass(frozen=True)
@@ -132,10 +135,10 @@ class Tags:
 
     aspect: Fraction = Fraction(1)  # width of a pixel over its height
     transfer: Transfer | None = None  # None for SDR
-    primaries: int = UNSPECIFIED  # H.273 code
+    primaries: int = ColorPrimaries.UNSPECIFIED  # H.273 code
     orientation: Orientation = Orientation()
     packing: Packing | None = None  # None where a frame is one view
-    transfer_code: int = UNSPECIFIED  # H.273
+    transfer_code: int = ColorTrc.UNSPECIFIED  # H.273
     right_first: bool = False  # the view of the right eye is at the left or at the top
     size: tuple[int, int] | None = None  # to which frames are scaled, as stored; None for their own
 
@@ -176,7 +179,7 @@ def read_packing(frame: av.VideoFrame) -> tuple[Packing | None, bool]:
         return None, False
     kind, flags = struct.unpack_from("=ii", data)
     packed = next((one for one in Packing if one.value == kind), None)
-    return packed, bool(flags & INVERTED)
+    return packed, bool(flags & 1)  # AV_STEREO3D_FLAG_INVERT
 
 
 def _unsqueeze(shape: Fraction, packing: Packing) -> Fraction:
@@ -251,8 +254,8 @@ class DecodedPicture:
         Phones write log (Apple Log and others) with the primaries of BT.2020 and no transfer.
         """
         code = self.tags.transfer_code
-        return code in LOGARITHMIC or (
-            self.tags.primaries == BT2020 and code in (0, UNSPECIFIED, RESERVED))
+        return code in (ColorTrc.LOG, ColorTrc.LOG_SQRT) or (
+            self.tags.primaries == BT2020 and code in (0, *_UNTAGGED))
 
     def rgb(self) -> NDArray[np.uint8]:
         """Returns the frame as displayed: upright 8-bit full-range RGB [H, W, 3], HDR as SDR."""
@@ -269,13 +272,14 @@ class DecodedPicture:
 
         They weight R, G and B as BT.601 does, for any matrix: swscale's gray has no other.
         """
-        gray = self._reformat("gray", Colorspace.ITU601 if self._untagged() else None)
+        gray = self._reformat("gray", Colorspace.ITU601 if self._is_untagged else None)
         if self.tags.transfer is not None:
             gray = cv2.LUT(gray, gray_table(self.tags.transfer))
         return self.tags.orientation.apply(gray)
 
     def _colours(self, pixels: str) -> NDArray[np.generic]:
-        return self._reformat(pixels, self._guessed_matrix() if self._untagged() else None, ROUNDED)
+        matrix = self._guessed_matrix() if self._is_untagged else None
+        return self._reformat(pixels, matrix, ROUNDED)
 
     def _reformat(
         self, pixels: str, matrix: Colorspace | None, interpolation: Interpolation | None = None,
@@ -286,8 +290,9 @@ class DecodedPicture:
             width=width, height=height, format=pixels, src_colorspace=matrix,
             dst_colorspace=matrix, interpolation=interpolation).to_ndarray()[rows, columns]
 
-    def _untagged(self) -> bool:
-        return self.frame.colorspace in (UNSPECIFIED, RESERVED)
+    @property
+    def _is_untagged(self) -> bool:
+        return self.frame.colorspace in _UNTAGGED
 
     def _guessed_matrix(self) -> Colorspace:
         """Returns the matrix that players take where the frame names none."""
@@ -297,10 +302,10 @@ class DecodedPicture:
         return Colorspace.ITU709 if large else Colorspace.ITU601
 
     def _white(self) -> int:
-        """Returns swscale's white at 16 bits: full range of n bits ends at 2^n - 1 of 2^n."""
+        """Returns swscale's white at 16 bits."""
         full = self.frame.color_range == ColorRange.JPEG
         depth = self.frame.format.components[0].bits
-        return 65536 - (1 << 16 - depth) if full and not self.frame.format.is_rgb else WHITE
+        return full_range_white(depth) if full and not self.frame.format.is_rgb else WHITE
 
 
 def deinterlace(

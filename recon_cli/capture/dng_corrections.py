@@ -22,16 +22,15 @@ import cv2
 import numpy as np
 import rawpy
 from numpy.typing import NDArray
+from PIL.ExifTags import Base as Tag
 
-from recon_cli.capture.tiff import LENGTH, PHOTOMETRIC, WIDTH, read_directories
+from recon_cli.capture.tiff import Photometric, read_directories
 
-LISTS = {2: 51009, 3: 51022}  # tags: what is to be done before and after demosaicing
-ACTIVE_AREA = 50829  # tag: top, left, bottom, right
-WARP, VIGNETTE, GAIN_MAP = 1, 3, 9  # opcodes
-# Those that change brightness or geometry and are not applied.
-LEFT_OUT = {2: "WarpFisheye", 7: "MapTable", 8: "MapPolynomial", 10: "DeltaPerRow",
-            11: "DeltaPerColumn", 12: "ScalePerRow", 13: "ScalePerColumn", 14: "WarpRectilinear2"}
-SENSOR = (32803, 34892)  # photometric interpretations of a mosaic, and of linear colours
+# The opcodes that change brightness or geometry, by their codes; three of them are applied.
+_OPCODES = {
+    1: "WarpRectilinear", 2: "WarpFisheye", 3: "FixVignetteRadial", 7: "MapTable",
+    8: "MapPolynomial", 9: "GainMap", 10: "DeltaPerRow", 11: "DeltaPerColumn", 12: "ScalePerRow",
+    13: "ScalePerColumn", 14: "WarpRectilinear2"}
 UNREADABLE = (OSError, SyntaxError, ValueError, TypeError, IndexError, struct.error)
 GRID = 65  # knots a side of a polynomial's grid: between them it is off by some 1e-4
 
@@ -101,7 +100,8 @@ def read_corrections(path: Path) -> Corrections:
     """Returns the corrections of a RAW file; none where it is not a DNG, or they are damaged."""
     with suppress(*UNREADABLE):
         for tags in read_directories(path):
-            if tags.get(PHOTOMETRIC) in SENSOR:
+            if tags.get(Tag.PhotometricInterpretation) in (
+                    Photometric.MOSAIC, Photometric.LINEAR):
                 return _collect(tags)
     return Corrections()
 
@@ -161,31 +161,32 @@ def _count(photos: int) -> str:
 
 
 def _collect(tags: Mapping[int, Any]) -> Corrections:
-    area = tags.get(ACTIVE_AREA, (0, 0, tags[LENGTH], tags[WIDTH]))
-    height, width = area[2] - area[0], area[3] - area[1]
+    top, left, bottom, right = tags.get(
+        Tag.ActiveArea, (0, 0, tags[Tag.ImageLength], tags[Tag.ImageWidth]))
     gains, warp, left_out = list[GainMap](), None, list[str]()
-    for number, tag in LISTS.items():
-        for code, data in _opcodes(tags.get(tag, bytes(4))):
-            if code == WARP and warp is None:
-                warp = _read_warp(data)
-            elif code == GAIN_MAP and warp is None:
-                gains.append(_read_gain_map(data, of_colours=number == 3))
-            elif code == VIGNETTE and warp is None:
-                gains.append(_read_vignette(data, height, width))
-            elif code in (WARP, GAIN_MAP, VIGNETTE):
+    for tag in (Tag.OpcodeList2, Tag.OpcodeList3):  # for before and after demosaicing
+        for name, data in _opcodes(tags.get(tag, bytes(4))):
+            if name not in ("WarpRectilinear", "GainMap", "FixVignetteRadial"):
+                left_out.append(name)
+            elif warp is not None:
                 left_out.append("corrections behind a warp")
-            elif code in LEFT_OUT:
-                left_out.append(LEFT_OUT[code])
+            elif name == "WarpRectilinear":
+                warp = _read_warp(data)
+            elif name == "GainMap":
+                gains.append(_read_gain_map(data, of_colours=tag is Tag.OpcodeList3))
+            else:
+                gains.append(_read_vignette(data, bottom - top, right - left))
     return Corrections(tuple(gains), warp, tuple(dict.fromkeys(left_out)))
 
 
-def _opcodes(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yields the opcodes of a list, each with its parameters; they are big-endian."""
+def _opcodes(data: bytes) -> Iterator[tuple[str, bytes]]:
+    """Yields the names of `_OPCODES` in a list, each with its parameters; they are big-endian."""
     count, = struct.unpack_from(">I", data)
     place = 4
     for _ in range(count):
         code, _, _, length = struct.unpack_from(">4I", data, place)
-        yield code, data[place + 16:place + 16 + length]
+        if code in _OPCODES:
+            yield _OPCODES[code], data[place + 16:place + 16 + length]
         place += 16 + length
 
 

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.limits import MEASURE_SIZE, MIN_TRACKS, RETURN_ERROR, WINDOW
 from recon_cli.errors import InputError
+
+Value = TypeVar("Value", np.uint8, np.float32)
 
 TRACK_WIDTH = 320  # pixels; wide enough for corners, small enough for 5 ms a frame
 ANCHOR_REACH = 0.03  # of the width, about 10 px: still well inside the tracker's basin
-MIN_TRACKS = 8  # fewer agree by chance
 # Corners as in Shi and Tomasi; their spacing spreads 300 of them over the frame.
 MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING = 300, 0.005, 6
-# 15 px windows on 4 pyramid levels follow about 40 px at this width.
-WINDOW, LEVELS = (15, 15), 3
-RETURN_ERROR = 1.0  # pixels between a corner and where following it there and back ends
+# Windows of 15 px on 4 pyramid levels follow about 40 px at this width.
+LEVELS = 3
 # Gray values of 8 bits; a codec moves true black and white by a few.
 BLACK, BLOWN_OUT = 16, 250
 # More than this and the frame is clipped: it is avoided where neighbours are better.
@@ -29,8 +31,18 @@ ALL_CLIPPED = 0.95
 FLAT = 4.0
 AREAS = 32  # along each side
 EVERY = 4  # pixels; a share is known well enough from every 16th
-# Pixels on the longest side: sharpness is comparable and free of the sensor noise of large frames.
-SHARPNESS_SIZE = 960
+
+
+def shrink(image: NDArray[Value], longest: int) -> NDArray[Value]:
+    """Returns an image [H, W, ...] reduced by area to so many pixels on its longer side.
+
+    `io.images.fit_image` fits its sides to whole pixels instead, which shifts edges by a fraction.
+    """
+    scale = longest / max(image.shape[:2])
+    if scale >= 1:
+        return image
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, image.dtype)
 
 
 class MotionMeter:
@@ -148,9 +160,7 @@ def measure_sharpness(
 
     `hidden` [h, w], at any size, leaves out pixels that do not show the scene.
     """
-    scale = SHARPNESS_SIZE / max(gray.shape)
-    if scale < 1:
-        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    gray = shrink(gray, MEASURE_SIZE)
     edges = np.asarray(cv2.Laplacian(gray, cv2.CV_32F))
     return float((edges if hidden is None else edges[_visible(hidden, gray.shape) > 0]).var())
 

@@ -34,15 +34,15 @@ from recon_cli.capture.same_view import (
 )
 from recon_cli.errors import InputError, list_names
 from recon_cli.workspace import atomic
+from recon_cli.workspace.records import MIN_FRAMES
 
 CHOICE = "choice.json"
-MIN_FRAMES = 3  # two views leave nothing to check a reconstruction with
 # A frame is compared with the 75th percentile of the 31 around it: a few sharp ones set the level.
 GATE_WINDOW, GATE_PERCENTILE = 31, 75
 # Path between chosen frames in widths of the image: 94% overlap; 75 frames of a 10 s walk.
 FRAME_SPACING = 0.06
 # Sharp frames further apart (88% overlap), as in a fast turn, get the least blurred ones between.
-MAX_GAP = 0.12
+MAX_GAP = 2 * FRAME_SPACING
 # A plain sharp view fails that test, but is 5 to 10 times sharper than blurred frames of its gap.
 MUCH_SHARPER = 2.0
 # Frames of a camera that hardly moves, to average out noise.
@@ -51,9 +51,8 @@ MIN_AUTOMATIC = 24
 MAX_STEP = 0.1
 # A shorter path (a third of a pixel in 320) is tracking noise of a camera on a tripod.
 NO_MOTION = 0.001
-# A shorter path, two steps of the usual spacing, causes a notice.
-LITTLE_MOTION = 2 * FRAME_SPACING
-NAMED = 8  # photos that a message lists; all are in the record of the selection
+# A shorter path causes a notice.
+LITTLE_MOTION = MAX_GAP
 
 
 class Reason(StrEnum):
@@ -375,5 +374,5 @@ def describe_dropped(
         for photo in dropped if photo.reason is reason] for reason in reasons}
     return [
         f"{len(names[reason])} photos are left out because {text}: "
-        f"{list_names(names[reason], NAMED)}." for reason, text in reasons.items()
+        f"{list_names(names[reason])}." for reason, text in reasons.items()
         if names[reason]]

@@ -19,8 +19,8 @@ from recon_cli.capture import frame_selection
 from recon_cli.capture.contact_sheet import ContactSheet
 from recon_cli.capture.dng_corrections import describe_corrections, read_corrections
 from recon_cli.capture.frame_selection import FrameCandidate, Reason
-from recon_cli.capture.from_video import judge, report_reduced, report_short
-from recon_cli.capture.images import WHITE, Photo, describe_white, find_white, read_photo
+from recon_cli.capture.from_video import SCAN, judge, report_reduced, report_short
+from recon_cli.capture.images import Photo, choose_white, read_photo
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource, Selection
 from recon_cli.capture.known_files import find_foreign, find_lists
 from recon_cli.capture.lens_border import hide_border
@@ -53,7 +53,7 @@ from recon_cli.capture.photos import (
 from recon_cli.capture.raw import RawPlan, develop, plan_raw
 from recon_cli.capture.same_view import PhotoMeasures, measure_photo
 from recon_cli.config.stages import IngestConfig
-from recon_cli.errors import FormatError, InputError, ManifestError, list_names
+from recon_cli.errors import MOST_NAMED, FormatError, InputError, ManifestError, list_names
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
 from recon_cli.io.tracks import Tracks
 from recon_cli.scene.camera import panorama_lens
@@ -62,7 +62,6 @@ from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
-SEQUENCE = "sequence.json"  # which photos follow each other, for the next run; beside a scan
 # Frames that are kept of any folder, however little the camera moves: somebody may have picked
 # them, and all pairs of so many are matched in minutes.
 MIN_KEPT = 100
@@ -82,14 +81,14 @@ def ingest(
     check_count(path, folder.photos, folder.broken)
     plan = _plan_raw(folder.photos, out / f"{prefix}{PLAN}", ctx)
     photos = _drop_raw_twins(folder.photos, plan, ctx)
-    white = _find_white(photos, ctx)
+    white = choose_white([photo.path for photo in photos if photo.wide], ctx.notice)
     for coding, count in Counter(photo.coding for photo in photos if photo.coding).items():
         ctx.notice(f"{count} {'photos are' if count > 1 else 'photo is'} {coding.words}: "
                    "converted to sRGB as video is.")
     sequence, strangers = None, list[str]()
     if not folder.panoramas:
         photos, sequence, strangers = _find_sequence(
-            photos, out / f"{prefix}{SEQUENCE}", ctx, white=white)
+            photos, out / f"{prefix}{SCAN}", ctx, white=white)
     masks = _find_masks(paths, home, photos, ctx)
     stems = make_frame_names([photo.path.stem for photo in photos])
     source = _PhotoSource(path, tuple(photos), tuple(f"{prefix}{stem}" for stem in stems),
@@ -129,10 +128,10 @@ def ingest(
 
 
 def _find_sequence(
-    photos: Sequence[Photo], record: Path, ctx: IngestContext, *, white: int
+    photos: Sequence[Photo], scan_file: Path, ctx: IngestContext, *, white: int
 ) -> tuple[list[Photo], PhotoSequence | None, list[str]]:
     """Returns the photos without strangers, those that follow each other, and the strangers."""
-    sequence = find_sequence(photos, record, ctx, white=white)
+    sequence = find_sequence(photos, scan_file, ctx, white=white)
     strangers = [] if sequence is None else [photos[place].name for place in sequence.strangers]
     strangers += [photos[place].name for place in find_odd(
         photos, () if sequence is None else (*sequence.places, *sequence.strangers), white=white)]
@@ -140,7 +139,7 @@ def _find_sequence(
         return list(photos), sequence, []
     ctx.notice(
         f"{len(strangers)} photos are set aside, because they show nothing that the others show: "
-        f"{list_names(strangers, frame_selection.NAMED)}.")
+        f"{list_names(strangers)}.")
     kept = [place for place, photo in enumerate(photos) if photo.name not in strangers]
     return ([photos[place] for place in kept],
             None if sequence is None else sequence.among(kept), strangers)
@@ -267,9 +266,9 @@ def _choose_followed(
 
 def _report_broken(broken: Mapping[str, str], ctx: IngestContext) -> None:
     """Says which photos cannot be read, and why."""
-    for reason in list(broken.values())[:frame_selection.NAMED]:
+    for reason in list(broken.values())[:MOST_NAMED]:
         ctx.notice(f"A photo is left out: {reason}")
-    if (more := len(broken) - frame_selection.NAMED) > 0:
+    if (more := len(broken) - MOST_NAMED) > 0:
         ctx.notice(f"{more} more photos are left out for similar reasons.")
 
 
@@ -311,15 +310,6 @@ def _describe_beside(paths: Sequence[Path], home: Path) -> list[str]:
     return masks + [found.notice(home) for found in find_foreign(home)]
 
 
-def _find_white(photos: Sequence[Photo], ctx: IngestContext) -> int:
-    """Returns the brightest value of photos with 16 bits, and says where it is below 65535."""
-    wide = [photo.path for photo in photos if photo.wide]
-    white = find_white(wide) if wide else WHITE
-    if white < WHITE:
-        ctx.notice(describe_white(len(wide), white))
-    return white
-
-
 def _find_masks(
     paths: Sequence[Path], home: Path, photos: Sequence[Photo], ctx: IngestContext
 ) -> FolderMasks:
@@ -330,8 +320,7 @@ def _find_masks(
     if masks.outside:
         ctx.notice(f"{masks.outside} is not used; give {masks.outside.parent} to use it.")
     if masks.unused:
-        names = list_names(masks.unused, frame_selection.NAMED)
-        ctx.notice(f"Masks without a photo are left out: {names}.")
+        ctx.notice(f"Masks without a photo are left out: {list_names(masks.unused)}.")
     if masks.unused and not masks.by_photo:
         ctx.notice(
             f"No mask is used: the mask of {photos[0].name} must be called "

@@ -89,7 +89,7 @@ def judge(
 
     Where fewer than `least` are sharp, the sharpest of the others may be chosen, too.
     """
-    check_exposure(path.name, scan.exposure[scan.intact], least=frame_selection.MIN_FRAMES)
+    check_exposure(path.name, scan.exposure[scan.intact], least=store.MIN_FRAMES)
     intact = int(scan.intact.sum())
     clipped = intact - int(well_exposed(scan.exposure[scan.intact]).sum())
     if 2 * clipped > intact:  # the rest cannot replace what they showed
@@ -138,7 +138,7 @@ def frame_counts(config: IngestConfig, sources: Sequence[ScannedVideo]) -> list[
         return [total] * len(sources)
     sums = np.cumsum([source.lengths[-1] for source in sources])
     cuts = np.round(sums / sums[-1] * total).astype(int)
-    return [max(frame_selection.MIN_FRAMES, int(count)) for count in np.diff(cuts, prepend=0)]
+    return [max(store.MIN_FRAMES, int(count)) for count in np.diff(cuts, prepend=0)]
 
 
 def ingest(
@@ -194,10 +194,10 @@ def ingest(
 def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
     """Says how many frames are missing or damaged; refuses a video that has too few left."""
     decoded, intact = len(scan.intact), int(scan.intact.sum())
-    if intact < frame_selection.MIN_FRAMES:
+    if intact < store.MIN_FRAMES:
         raise InputError(
             f"{path} has {intact} undamaged frames of {scan.expected}, but at least "
-            f"{frame_selection.MIN_FRAMES} are needed.",
+            f"{store.MIN_FRAMES} are needed.",
             hint="Give a longer video, or copy it from the camera again if it should be longer.")
     inexact = max(COUNT_SHARE * scan.declared, COUNT_FRAMES)
     if intact < decoded or scan.gaps or scan.lost > inexact:
@@ -215,15 +215,15 @@ def report_short(
     intact, usable, distinct = (
         int(flags.sum())
         for flags in (source.scan.intact, source.judgement.usable, source.distinct))
-    if usable < frame_selection.MIN_FRAMES:
+    if usable < store.MIN_FRAMES:
         raise InputError(
             f"Only {usable} of {intact} frames are sharp, but at least "
-            f"{frame_selection.MIN_FRAMES} are needed.",
+            f"{store.MIN_FRAMES} are needed.",
             hint="Lower --sharpness, or record again with slower movements.")
-    if distinct < frame_selection.MIN_FRAMES:
+    if distinct < store.MIN_FRAMES:
         raise InputError(
             f"{source.path} shows {distinct} different picture{'s' * (distinct != 1)} in {usable} "
-            f"frames, but at least {frame_selection.MIN_FRAMES} are needed.",
+            f"frames, but at least {store.MIN_FRAMES} are needed.",
             hint="Record again while you walk sideways through the room.")
     if requested is None or chosen == requested:
         return

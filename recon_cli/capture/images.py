@@ -7,7 +7,7 @@ InputError. Colours become sRGB, see `colour_profile`.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -25,15 +25,10 @@ from PIL import ExifTags, Image
 
 from recon_cli.capture.colour_profile import Coding, convert_coding, read_coding, to_srgb
 from recon_cli.capture.exif import ExifLens, read_exposure, read_lens
-from recon_cli.capture.tiff import (
-    BITS,
-    LENGTH,
-    WIDTH,
-    UnsupportedError,
-    is_misread,
-    read_tiff,
-)
+from recon_cli.capture.limits import MEASURE_SIZE
+from recon_cli.capture.tiff import WHITE, UnsupportedError, is_misread, read_tiff
 from recon_cli.capture.unreadable import BROKEN, DAMAGED, unreadable_error
+from recon_cli.capture.video_colour import full_range_white
 from recon_cli.capture.xmp import PanoramaArea, is_panorama, panorama_area, read_xmp
 from recon_cli.errors import InputError
 from recon_cli.io.images import decode_file, fit_size
@@ -56,8 +51,6 @@ TURNS = {
     4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_90}
 QUARTER_TURNS = frozenset({5, 6, 7, 8})  # those of them that swap width and height
-RAW_QUARTER_TURN = 4  # a bit of LibRaw's flip
-
 
 # Bytes of memory for a pixel while it is read: the peaks of pictures of 24 megapixels were 14 to 18
 # (Pillow's copies before and after it is turned, and arrays), and 17 to 30 with 16 bits.
@@ -66,10 +59,8 @@ PIXEL_BYTES, WIDE_PIXEL_BYTES = 20, 32
 # depth behind, one of three bytes each; the number of components lies before it.
 CODE_STREAM, COMPONENTS, DEPTHS = b"\xff\x4f\xff\x51", 40, 42
 
-WHITE = 65535
-GRAY_SIZE = 960  # pixels of the longer side, at least, at which measures are taken
-# Those of sensors with 8, 10, 12 and 14 bits, whose values are stored in 16 as they are.
-NARROW = (255, 1023, 4095, 16383)
+# Of sensors whose values are stored in 16 bits as they are.
+NARROW = tuple(2**bits - 1 for bits in (8, 10, 12, 14))
 
 
 @dataclass(frozen=True)
@@ -153,12 +144,12 @@ def read_photo(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
 def read_gray(photo: Photo, white: int = WHITE) -> NDArray[np.uint8]:
     """Returns the gray values of a photo, upright.
 
-    They may be reduced, to `GRAY_SIZE` pixels or more on the longer side.
+    They may be reduced, to `MEASURE_SIZE` pixels or more on the longer side.
     JPEG decodes to gray and to a fraction of its size in a quarter of the time.
     """
     try:
         with open_image(photo.path) as image:
-            image.draft("L", fit_size(*image.size, GRAY_SIZE))
+            image.draft("L", fit_size(*image.size, MEASURE_SIZE))
             if (image.mode in ("L", "RGB") and not photo.wide and photo.coding is None
                     and not is_misread(image) and not image.has_transparency_data):
                 gray = image.convert("L")
@@ -276,7 +267,8 @@ def _formats() -> tuple[str, ...]:
 def _size_in_file(image: Image.Image) -> tuple[int, int]:
     """Returns width and height before rotation; for a TIFF, Pillow gives those after it."""
     tags = getattr(image, "tag_v2", {})
-    return tags.get(WIDTH, image.width), tags.get(LENGTH, image.height)
+    return (tags.get(ExifTags.Base.ImageWidth, image.width),
+            tags.get(ExifTags.Base.ImageLength, image.height))
 
 
 def _orientation(image: Image.Image) -> int:
@@ -308,10 +300,13 @@ def find_white(paths: Iterable[Path]) -> int:
     return next((white for white in NARROW if 0 < brightest <= white), WHITE)
 
 
-def describe_white(count: int, white: int) -> str:
-    """Returns the notice that pictures of 16 bits hold fewer, and are brightened."""
-    return (f"The {count} pictures of 16 bits hold values of {white.bit_length()} bits, up to "
-            f"{white}: {white} is taken for white, instead of {WHITE}.")
+def choose_white(wide: Sequence[Path], notice: Callable[[str], None]) -> int:
+    """Returns `find_white` of pictures of 16 bits, with a notice where it is below 65535."""
+    white = find_white(wide)
+    if white < WHITE:
+        notice(f"The {len(wide)} pictures of 16 bits hold values of {white.bit_length()} bits, up "
+               f"to {white}: {white} is taken for white, instead of {WHITE}.")
+    return white
 
 
 def is_wide(path: Path) -> bool:
@@ -355,7 +350,8 @@ def _eight_bits(path: Path, image: Image.Image, white: int) -> Image.Image:
 
 def _is_wide(path: Path, image: Image.Image) -> bool:
     """Returns whether values have more than 8 bits; of colours Pillow would drop the others."""
-    if image.mode[0] == "I" or max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
+    bits = getattr(image, "tag_v2", {}).get(ExifTags.Base.BitsPerSample, (8,))
+    if image.mode[0] == "I" or max(bits) > 8:
         return True
     if image.format == "JPEG2000":
         return _jpeg2000_white(path) > 255
@@ -396,7 +392,7 @@ def _read_signal(path: Path, image: Image.Image) -> tuple[NDArray[np.uint16], in
     bits = image.info.get("bit_depth", 8) if image.format == "HEIF" else 8
     if bits > 8:
         deep = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
-        values, white = np.asarray(deep), 65536 - (1 << 16 - bits)
+        values, white = np.asarray(deep), full_range_white(bits)
     elif _is_wide(path, image) or is_misread(image):
         values, white = np.asarray(_read_wide(path, image)), WHITE
     else:
@@ -435,6 +431,6 @@ def _inspect_raw(path: Path) -> Photo:
     with suppress(*BROKEN), path.open("rb") as file:
         exif.load_from_fp(file)
         lens = read_lens(exif, width, height)
-    if sizes.flip & RAW_QUARTER_TURN:
+    if sizes.flip & 4:  # the bit of a quarter turn
         width, height = height, width
     return Photo(path, width, height, lens.focal_px, lens.camera, lens.focal_mm or focal or None)

@@ -21,16 +21,15 @@ from itertools import islice
 from pathlib import Path
 
 from recon_cli.capture.images import PHOTO_SUFFIXES
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, command_line, name_command
 from recon_cli.workspace.export_formats import READABLE
 
 _READ = 1 << 23  # bytes of a file that are searched for its marks
 _TRIED = 50  # files of a pattern; a capture has thousands of one kind
-_LISTED = 0.5  # a text that names this share of the pictures belongs to them
 _TEXTS = frozenset({".csv", ".json", ".jsonl", ".tsv", ".txt", ".xml", ".yaml", ".yml"})
 _ARRAYS = frozenset({".bin", ".geojson", ".npy", ".npz", ".traj", ".tum"})
 # First bytes, their offset, and the command that unpacks such a file into a folder.
-_UNPACK = "mkdir -p {folder} && {command} && recon ingest {folder}"
+_UNPACK = "mkdir -p {folder} && {command} && {ingest}"
 _SIGNATURES: tuple[tuple[bytes, int, str], ...] = (
     (b"PK\x03\x04", 0, "unzip {file} -d {folder}"),
     (b"PK\x05\x06", 0, "unzip {file} -d {folder}"),
@@ -182,11 +181,11 @@ KNOWN_FILES: tuple[KnownFiles, ...] = (
                   (b"extrinsic",)),
     KnownFiles(
         "poses as in a transforms.json", "poses", ("*.json", "*/transforms*.json"),
-        (b'"transform_matrix"',), advice="recon ingest {file}, once it is called transforms.json"),
+        (b'"transform_matrix"',), advice="{ingest_file}, once it is called transforms.json"),
     KnownFiles(
         "a COLMAP model", "poses", tuple(
             f"{'*/' * depth}cameras{suffix}" for depth in (1, 2, 3)
-            for suffix in (".bin", ".txt")), advice="recon ingest {parent}",
+            for suffix in (".bin", ".txt")), advice="{ingest_parent}",
         lost=tuple(LostFiles(
             (f"{place}/{part}.{kind}",), (f"{place}/cameras.{kind}",), "images")
             for place in _MODELS for part in ("images", "frames") for kind in ("bin", "txt"))),
@@ -225,9 +224,10 @@ class Found:
         """Returns a sentence with the command that uses it; empty without one."""
         names = {name: shlex.quote(str(path)) for name, path in (
             ("folder", self.folder), ("file", self.path), ("parent", self.path.parent))}
+        names |= {f"ingest_{name}": command_line(f"ingest {path}") for name, path in names.items()}
         steps = []
         if self.row.convert:
-            then = ", then `recon ingest SCENE`" * ("SCENE" in self.row.convert)
+            then = f", then {name_command('ingest SCENE')}" * ("SCENE" in self.row.convert)
             steps.append(f"`{self.row.convert.format(**names)}`{then}")
         if self.row.advice:
             steps.append(self.row.advice.format(**names))
@@ -237,9 +237,9 @@ class Found:
         """Returns a notice for the user; `where` is the input that they gave."""
         place = self.place if self.folder == where else self.path
         if self.row.layout and self.folder != where:
-            whole = shlex.quote(str(self.folder))
+            whole = command_line(f"ingest {shlex.quote(str(self.folder))}")
             return (f"{place} is {self.row.words}: its {self.row.carries} are not used with "
-                    f"these pictures alone; recon ingest {whole} uses them.")
+                    f"these pictures alone; {whole} uses them.")
         if self.row.layout:
             return (f"{place} is {self.row.words}, but files that belong to it are missing or in "
                     f"another place: its {self.row.carries} are not read, and the cameras are "
@@ -297,7 +297,7 @@ def find_lists(folder: Path, names: Sequence[str], *, known: Collection[Path]) -
     lists = []
     for path in texts if wanted else ():
         data = read_head(path)
-        if sum(name in data for name in wanted) >= _LISTED * len(wanted):
+        if 2 * sum(name in data for name in wanted) >= len(wanted):
             lists.append(path)
     return lists
 
@@ -345,17 +345,19 @@ def refuse_other_file(path: Path) -> None:
     """Raises InputError for a file that is an archive, a scene, a text or data."""
     suffix = path.suffix.lower()
     if suffix in _SCENES:
+        command = command_line(f"import {shlex.quote(str(path))}")
         raise InputError(f"{path} is a scene or a mesh, not a capture.",
-                         hint=f"recon import {shlex.quote(str(path))} reads a finished scene.")
-    command = _unpacking(path)
-    if command is not None:
+                         hint=f"{command} reads a finished scene.")
+    unpacking = _unpacking(path)
+    if unpacking is not None:
         folder = shlex.quote(str(path.with_name(path.name.split(".")[0] or "unpacked")))
         if (path.parent / path.name.split(".")[0]).is_file():
             folder = shlex.quote(f"{path}.d")
-        unpack = command.format(file=shlex.quote(str(path)), folder=folder)
+        unpack = unpacking.format(file=shlex.quote(str(path)), folder=folder)
         raise InputError(
             f"{path} is an archive, not a video.", hint="Unpack it, and give the folder: "
-            + _UNPACK.format(folder=folder, command=unpack))
+            + _UNPACK.format(
+                folder=folder, command=unpack, ingest=command_line(f"ingest {folder}")))
     if suffix in _MESHES:
         raise InputError(f"{path} is a mesh or a point cloud, not a capture.",
                          hint="Give the video or the photos that it was made from.")
@@ -363,7 +365,7 @@ def refuse_other_file(path: Path) -> None:
     if found is not None and found.row.layout:
         raise InputError(
             f"{path} belongs to {found.row.words}; needed is the folder with all its files.",
-            hint=f"Give the folder: recon ingest {shlex.quote(str(path.parent))}.")
+            hint=f"Give the folder: {command_line(f'ingest {shlex.quote(str(path.parent))}')}.")
     if found is not None:
         raise InputError(
             f"{path} is {found.row.words}, which are not read; needed are the pictures.",
@@ -379,8 +381,8 @@ def _ingest_beside(path: Path) -> str:
     """Returns the command that reads the photos beside a file, if there are any."""
     with suppress(OSError):
         if any(file.suffix.lower() in PHOTO_SUFFIXES for file in path.parent.iterdir()):
-            return f"recon ingest {shlex.quote(str(path.parent))}"
-    return "recon ingest PHOTOS"
+            return command_line(f"ingest {shlex.quote(str(path.parent))}")
+    return command_line("ingest PHOTOS")
 
 
 def _unpacking(path: Path) -> str | None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.frame_measures import shrink
 from recon_cli.capture.ingested_source import IngestContext
 from recon_cli.capture.masks import write_mask
 from recon_cli.io.images import read_png
@@ -83,7 +84,7 @@ class BorderMeter:
         """Takes a frame; all are of one size."""
         if self._filled:
             return
-        small = _reduce(gray)
+        small = shrink(gray, SIZE)
         self._brightest = (small if self._brightest is None
                            else np.maximum(self._brightest, small))
         self._filled = not _has_black_corners(self._brightest)
@@ -141,16 +142,7 @@ def fit_circle(brightest: NDArray[np.uint8]) -> LensCircle | None:  # [h, w]
 
 def _read_small(path: Path) -> NDArray[np.uint8]:  # [h, w]
     """Returns the brightest channel of a frame, reduced."""
-    return np.asarray(_reduce(read_png(path)).max(axis=2), np.uint8)
-
-
-def _reduce(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Returns an image whose longer side is `SIZE` at most."""
-    scale = SIZE / max(image.shape[:2])
-    if scale >= 1:
-        return image
-    return np.asarray(cv2.resize(
-        image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(shrink(read_png(path), SIZE).max(axis=2), np.uint8)
 
 
 def _has_black_corners(image: NDArray[np.uint8]) -> bool:

@@ -20,6 +20,9 @@ import cv2
 import numpy as np
 import pywt
 from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from recon_cli.capture.limits import CLIPPED_SHARE
 
 # 64 tiles leave 800 wavelet coefficients each in a frame of 600x340: known to 3%. The middle of a
 # larger one has 1,600: on 16 photos of four captures, with and without noise of 10, within .3 of
@@ -27,9 +30,8 @@ from numpy.typing import NDArray
 GRID, SMALLEST_TILE, LARGEST_TILE = 8, 16, 80
 # The 10th percentile finds tiles without texture as long as a tenth of the frame is plain.
 FLAT_PERCENTILE = 10
-NORMAL_QUARTILE = 0.6744897501960817  # of the standard normal distribution, at three quarters
-# Tiles with more pixels than this at 0 or 255 are left out: clipping cuts the noise in half.
-CLIPPED_SHARE = 0.02
+# Of the standard normal distribution; not by scipy.stats, which takes a second to import.
+NORMAL_QUARTILE = float(ndtri(0.75))
 # 7 pixels and 2.0 gain 7.3 dB at noise of 15, on four rendered frames and a photo;
 # 5 pixels gain 6.8 dB, 9 pixels 7.4 dB for twice the time.
 DIAMETER, SIGMA_SPACE = 7, 2.0
@@ -45,6 +47,7 @@ def estimate_noise(rgb: NDArray[np.uint8]) -> float:
         for length in rgb.shape[:2])
     tiles = [rgb[_middle(*tall), _middle(*wide)]
              for tall in pairwise(rows) for wide in pairwise(columns)]
+    # clipping cuts the noise in half
     usable = [tile for tile in tiles
               if np.mean((tile == 0) | (tile == 255)) <= CLIPPED_SHARE] or tiles
     by_shape: dict[tuple[int, ...], list[NDArray[np.uint8]]] = {}
@@ -62,8 +65,7 @@ def _middle(start: int, end: int) -> slice:
 
 def _tile_noise(tiles: NDArray[np.uint8]) -> list[float]:
     """Returns the noise of each tile [N, H, W, 3] in [0, 1], the mean over its channels."""
-    # All tiles in one transform; skimage's estimate_sigma, which does the same for one channel,
-    # imports scipy.stats for the one number below.
+    # All tiles in one transform; skimage's estimate_sigma does the same for one channel.
     terms = pywt.dwtn(np.moveaxis(tiles / 255.0, -1, 1), "db2", axes=(-2, -1))["dd"]
     terms[np.ptp(tiles, axis=(1, 2)) == 0] = 0  # a flat channel's terms are rounding
     return [float(np.sum([_deviation(channel) for channel in tile])) / 3 for tile in terms]

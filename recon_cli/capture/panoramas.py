@@ -17,25 +17,23 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from recon_cli.capture.decoded_picture import Packing
-from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import Photo, open_image
+from recon_cli.capture.limits import SAME_SHAPE, SAMPLED_PICTURES
 from recon_cli.capture.two_views import find_two_views, has_two_circles
 from recon_cli.capture.unreadable import BROKEN
 from recon_cli.capture.xmp import PanoramaArea
 from recon_cli.errors import InputError, list_names
-from recon_cli.io.views import evenly_spread
+from recon_cli.io.views import evenly_spread, spread_inside
+from recon_cli.workspace.records import MIN_FRAMES
 
 _SMALL = (256, 128)
 _DETAILED = (1280, 640)  # at which circles are round in pictures of 2:1, and features are found
-_CHECKED = 8  # panoramas of a set, evenly spread
 # In panoramas the edge columns are neighbours: they differ as neighbours do, while columns half a
 # turn apart differ by 4 to 40 times as much. The top or the bottom row is one point. 14 of 19 and
 # 60 of 60 panoramas pass both, and 1 of 446 photos of rooms that were cut to 2:1.
-_SEAM, _OPPOSITE, _POLE = 3.0, 3.0, 0.5
+_SEAM, _POLE = 3.0, 0.5
 # Wider pictures have no pole: at 2.2, 3 and 4:1 74 to 100 of 100 panoramas pass without it, and at
 # most 3 of 100 photos of seven captures.
-_LEAST, _SHARE = 3, 0.5  # of the checked pictures must pass where no metadata says it
-_ASPECT = 0.02  # of an asked-for panorama, which cameras crop by some pixels
 
 
 @dataclass(frozen=True)
@@ -64,10 +62,10 @@ def _drop_double(folder: str, photos: Sequence[Photo]) -> tuple[list[Photo], lis
     """
     doubled = {
         "unstitched pictures of two fisheye lenses": (
-            _find_double(photos, lambda shape: abs(shape / 2 - 1) <= _ASPECT, has_two_circles),
+            _find_double(photos, lambda shape: abs(shape / 2 - 1) <= SAME_SHAPE, has_two_circles),
             "Export them as 360-degree (equirectangular) pictures with the app of the camera."),
         "3D pictures with the views of both eyes side by side": (
-            _find_double(photos, lambda shape: shape > 2 * (1 + _ASPECT),
+            _find_double(photos, lambda shape: shape > 2 * (1 + SAME_SHAPE),
                          lambda pictures: find_two_views(pictures) is Packing.SIDE_BY_SIDE),
             "Cut one view out, for example with mkdir left && magick mogrify -path left -crop "
             "50%x100%+0+0 +repage *.jpg")}
@@ -95,7 +93,7 @@ def _find_double(
         if not photo.is_raw and fits(photo.width / photo.height):
             sizes.setdefault((photo.width, photo.height), []).append(photo)
     return [photo for alike in sizes.values()
-            if test([picture for one in evenly_spread(alike, _CHECKED)
+            if test([picture for one in evenly_spread(alike, SAMPLED_PICTURES)
                      if (picture := _read_small(one, _DETAILED)) is not None])
             for photo in alike]
 
@@ -103,7 +101,7 @@ def _find_double(
 def _choose_projection(folder: str, photos: Sequence[Photo], camera: str) -> ChosenPhotos:
     if camera == "equirectangular":
         odd = [photo for photo in photos if photo.area is None
-               and abs(photo.width / photo.height / 2 - 1) > _ASPECT]
+               and abs(photo.width / photo.height / 2 - 1) > SAME_SHAPE]
         if odd:
             raise InputError(
                 f"{len(odd)} of {len(photos)} pictures in {folder} are not twice as wide as high, "
@@ -175,7 +173,7 @@ def find_bands(photos: Sequence[Photo]) -> list[Photo]:
     Nothing says where that lies on the sphere.
     """
     wide = [photo for photo in photos if not photo.panorama and not photo.is_raw
-            and photo.width > 2 * (1 + _ASPECT) * photo.height]
+            and photo.width > 2 * (1 + SAME_SHAPE) * photo.height]
     return wide if _most_pass(wide, has_no_seam) else []
 
 
@@ -183,12 +181,11 @@ def _most_pass(
     photos: Sequence[Photo], test: Callable[[NDArray[np.uint8]], bool]
 ) -> bool:
     """Returns whether there are enough photos, and enough of those looked at pass a test."""
-    if len(photos) < _LEAST:
+    if len(photos) < MIN_FRAMES:
         return False
-    checked = [photos[int((at + 0.5) * len(photos) / _CHECKED)] for at in range(_CHECKED)]
-    pictures = [small for photo in dict.fromkeys(checked)
+    pictures = [small for photo in spread_inside(photos, SAMPLED_PICTURES)
                 if (small := _read_small(photo)) is not None]
-    return sum(map(test, pictures)) >= max(_LEAST, _SHARE * len(pictures))
+    return sum(map(test, pictures)) >= max(MIN_FRAMES, len(pictures) / 2)
 
 
 def wraps_around(rgb: NDArray[np.uint8]) -> bool:
@@ -205,7 +202,7 @@ def has_no_seam(rgb: NDArray[np.uint8]) -> bool:
     seam = np.abs(small[:, 0] - small[:, -1]).mean()
     steps = np.abs(np.diff(small, axis=1)).mean(axis=(0, 2))
     opposite = np.abs(small - np.roll(small, _SMALL[0] // 2, axis=1)).mean()
-    return bool(seam <= _SEAM * np.median(steps) and _OPPOSITE * seam < opposite)
+    return bool(seam <= _SEAM * np.median(steps) and _SEAM * seam < opposite)
 
 
 def _read_small(

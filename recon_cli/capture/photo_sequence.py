@@ -22,18 +22,21 @@ from PIL import ExifTags
 
 from recon_cli.capture.frame_measures import MotionMeter, measure_exposure, measure_sharpness
 from recon_cli.capture.frame_selection import MIN_AUTOMATIC
-from recon_cli.capture.images import WHITE, Photo, open_image, read_gray
+from recon_cli.capture.images import Photo, open_image, read_gray
 from recon_cli.capture.ingested_source import IngestContext
 from recon_cli.capture.lens_border import BorderMeter
 from recon_cli.capture.photos import group_photos
 from recon_cli.capture.scan import Scan
 from recon_cli.capture.strangers import find_strangers
+from recon_cli.capture.tiff import WHITE
 from recon_cli.capture.tracker import Tracker
 from recon_cli.capture.unreadable import BROKEN
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import InputError
 from recon_cli.io.tracks import merge_tracks
 from recon_cli.progress import Bar
-from recon_cli.workspace import atomic
+from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.json_record import JsonRecord
+from recon_cli.workspace.steps import StepFolder, log_path
 
 # A photo follows another where it still shows this share of the other's corners, and so do nearly
 # all photos of a sequence. .94 to 1 of them do in every third and fifth frame of six walks, .56 in
@@ -63,49 +66,33 @@ class PhotoSequence:
     scan: Scan  # of these
     strangers: tuple[int, ...]  # photos in between that show something else, by place
 
-    def write(self, record: Path, photos: Sequence[Photo]) -> None:
-        """Writes the scan beside a record that says which photos it is of."""
-        self.scan.write(_scan_file(record))
-        atomic.write_json(record, {
-            "photos": [photo.name for photo in photos], "places": self.places,
-            "strangers": self.strangers})
-
-    @classmethod
-    def read(cls, record: Path, photos: Sequence[Photo]) -> PhotoSequence | None:
-        """Reads the file of `write`; None where it is missing, damaged or of other photos."""
-        if not record.exists():
-            return None
-        try:
-            value = atomic.read_json(record, dict)
-            if value["photos"] != [photo.name for photo in photos]:
-                return None
-            scan = Scan.read(_scan_file(record))
-            known = cls(
-                tuple(map(int, value["places"])), scan, tuple(map(int, value["strangers"])))
-        except (AttributeError, KeyError, TypeError, ValueError, OSError, FormatError):
-            return None
-        return known if len(known.places) == len(scan.intact) else None
-
     def among(self, kept: Sequence[int]) -> PhotoSequence:
         """Returns the sequence among fewer photos, which hold all of it, given by place."""
         now = {place: index for index, place in enumerate(kept)}
         return replace(self, places=tuple(now[place] for place in self.places), strangers=())
 
 
-def _scan_file(record: Path) -> Path:
-    return record.with_name(record.name.replace("sequence", "scan"))
+@dataclass(frozen=True)
+class _SequencePlaces(JsonRecord):
+    """What a sequence has besides its scan."""
+
+    places: tuple[int, ...]
+    strangers: tuple[int, ...]
 
 
 def find_sequence(
-    photos: Sequence[Photo], record: Path, ctx: IngestContext, *, white: int = WHITE
+    photos: Sequence[Photo], scan_file: Path, ctx: IngestContext, *, white: int = WHITE
 ) -> PhotoSequence | None:
     """Returns the scan of those photos that follow each other; None where none do.
 
-    `record` keeps it for the next run; `white` is that of photos with 16 bits.
+    `scan_file` in the folder of a stage keeps it for the next run; `white` is that of photos with
+    16 bits.
     """
-    known = PhotoSequence.read(record, photos)
+    out, step = scan_file.parent, f"sequence of {scan_file.name}"
+    steps = StepFolder(out, log_path(out), key=sha256_json([photo.name for photo in photos]))
+    known = steps.find(step, _SequencePlaces)
     if known is not None:
-        return known
+        return PhotoSequence(known.places, Scan.read(scan_file), known.strangers)
     runs = list_runs(photos)
     parts: list[PhotoSequence] = []
     if runs:
@@ -115,7 +102,8 @@ def find_sequence(
     if not parts:
         return None
     sequence = _join(parts)
-    sequence.write(record, photos)
+    sequence.scan.write(scan_file)
+    steps.finish(step, _SequencePlaces(sequence.places, sequence.strangers), [scan_file])
     return sequence
 
 

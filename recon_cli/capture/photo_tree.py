@@ -16,7 +16,7 @@ from pathlib import Path
 from recon_cli.capture.images import PHOTO_SUFFIXES, inspect_photo
 from recon_cli.capture.known_files import Found, find_foreign, is_archive, picture_kind
 from recon_cli.capture.masks import MASK_FOLDERS, is_mask_file
-from recon_cli.errors import InputError, list_names
+from recon_cli.errors import InputError, command_line, list_names
 from recon_cli.workspace.layout import Workspace
 
 VIDEO_SUFFIXES = frozenset({
@@ -27,7 +27,6 @@ _REDUCED = re.compile(r"images_\d+")  # nerfstudio's and COLMAP's copies beside 
 _PICTURE_FOLDERS = frozenset({
     "color", "corrected_images", "frames", "images", "input", "keyframes", "photos", "pictures",
     "rgb", "rgbd"})
-_SAME_NAMES = 0.5  # a subfolder of which more pictures are called like those above holds copies
 _VERSIONS = "other versions of these photos"
 
 
@@ -60,7 +59,7 @@ def find_photo_files(folder: Path, out: Path | None = None) -> PhotoTree:
     top = {path.stem for path in walk.folders.get(home, ())}
     for place in [place for place in walk.folders if place != home]:
         same = sum(path.stem in top for path in walk.folders[place])
-        if same > _SAME_NAMES * len(walk.folders[place]):
+        if 2 * same > len(walk.folders[place]):  # most are called like those above
             walk.aside[place] = _VERSIONS, len(walk.folders.pop(place))
     _add_beside(walk, folder, home, out)
     files = tuple(path for paths in walk.folders.values() for path in paths)
@@ -116,8 +115,8 @@ def _describe_aside(
                 yield (f"{name} holds {count} masks, by its name, and is not used: masks are read "
                        f"from {home.parent if home != folder else home}/masks/.")
         elif kind in ("pictures", "photos behind a link", _VERSIONS):
-            yield (f"{name} holds {count} {kind} and is not used; recon ingest "
-                   f"{shlex.quote(str(place))} uses it instead.")
+            yield (f"{name} holds {count} {kind} and is not used; "
+                   f"{command_line(f'ingest {shlex.quote(str(place))}')} uses it instead.")
         else:
             yield (f"{name} holds {count} {kind}, by its name, and is not used: cameras and "
                    "geometry are found from the photos alone.")
@@ -150,8 +149,8 @@ def _describe_media(folders: Sequence[Path]) -> Iterator[str]:
     videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
     if videos:
         names = list_names([path.name for path in videos])
-        yield (f"Not used beside photos are videos: {names}. recon ingest "
-               f"{shlex.quote(str(folders[0]))} {shlex.quote(str(videos[0]))} uses "
+        both = shlex.join([str(folders[0]), str(videos[0])])
+        yield (f"Not used beside photos are videos: {names}. {command_line(f'ingest {both}')} uses "
                f"{'both' if len(videos) == 1 else 'the first, too'}.")
     arrays = [path.name for path in files if path.suffix.lower() in (".exr", ".pfm")]
     if arrays:
@@ -194,11 +193,11 @@ def _choose_home(folder: Path, foreign: Sequence[Found], out: Path | None) -> Pa
              if not picture_kind(path.name) and _walk(path, foreign, out).folders]
     images = [path for path in inner if path.name.lower() == "images"]
     if len(inner) > 1 and not images:
-        commands = " ".join(shlex.quote(str(path)) for path in inner)
+        command = command_line(f"ingest {shlex.join(map(str, inner))}")
         raise InputError(
             f"{folder} holds no photos itself, but {len(inner)} of its subfolders do: "
             f"{list_names([path.name for path in inner], 8)}.",
-            hint=f"Give those that show the scene, one or several: recon ingest {commands}")
+            hint=f"Give those that show the scene, one or several: {command}")
     if not inner:
         return folder
     place = (images or inner)[0]

@@ -10,20 +10,26 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from recon_cli.capture.depth_pictures import look_like_depth
-from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES, Photo, inspect_photo
 from recon_cli.capture.known_files import picture_kind
+from recon_cli.capture.limits import SAMPLED_PICTURES
 from recon_cli.capture.panoramas import choose_projection
 from recon_cli.capture.photo_tree import find_videos
-from recon_cli.errors import InputError, format_count, list_names
+from recon_cli.errors import (
+    MOST_NAMED,
+    InputError,
+    command_line,
+    format_count,
+    list_names,
+    name_command,
+)
 from recon_cli.io.views import evenly_spread
+from recon_cli.workspace.records import MIN_FRAMES
 
 SAFE_STEM = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
 _COLOURED = frozenset({"RGB", "RGBA", "RGBX", "P", "PA", "CMYK", "YCbCr", "LAB", "HSV"})
 _DEPTH = "depth maps"
 _NEVER = (_DEPTH, "confidence maps")  # of one channel and with such a name, they are never photos
-_MOST_ADVICES = 4  # on pictures of other kinds
-_LOOKED_AT = 8  # pictures of one channel, evenly spread, that tell what all of them show
 # Focal lengths that agree this well are one setting of the lens: EXIF rounds to a tenth of a mm.
 SAME_FOCAL = 0.01
 
@@ -75,7 +81,7 @@ def choose_pictures(
     notices += chosen.notices
     notices += [
         f"{photo.name} holds {photo.pictures} pictures, of which only the first is used. "
-        f"{unfold_advice(photo)}" for photo in rest if photo.pictures > 1][:_MOST_ADVICES]
+        f"{unfold_advice(photo)}" for photo in rest if photo.pictures > 1][:MOST_NAMED]
     return PhotoFolder(chosen.photos, found.broken, chosen.panoramas), notices
 
 
@@ -87,7 +93,7 @@ def _drop_depth_and_masks(
     coloured = sum(photo.mode in _COLOURED for photo in photos)
     depth_alone = bool(photos) and set(kinds.values()) == {_DEPTH}
     deep = [photo for photo in photos if kinds[photo] == _DEPTH]
-    shows_depth = look_like_depth([photo.path for photo in evenly_spread(deep, _LOOKED_AT)])
+    shows_depth = look_like_depth([photo.path for photo in evenly_spread(deep, SAMPLED_PICTURES)])
     if depth_alone and (shows_depth or picture_kind(folder.resolve().name) == _DEPTH):
         raise InputError(
             f"{folder} holds {len(photos)} depth maps (one channel of 16 bits), not photos.",
@@ -126,7 +132,7 @@ def unfold_advice(photo: Photo) -> str:
         "magick {file} -coalesce {target}")
     folder = shlex.quote(str(photo.path.with_suffix("")) + "_pictures")
     command = program.format(file=shlex.quote(str(photo.path)), target=f"{folder}/%04d.png")
-    return f"To use all: mkdir -p {folder} && {command} && recon ingest {folder}"
+    return f"To use all: mkdir -p {folder} && {command} && {command_line(f'ingest {folder}')}"
 
 
 def _natural_key(stem: str) -> list[tuple[int, str]]:
@@ -161,8 +167,8 @@ def _count_hint(folder: Path) -> str:
     if videos:
         named = shlex.quote(str(videos[0]))
         return (f"It holds {format_count(len(videos), 'video')}: "
-                f"{list_names([path.name for path in videos])}. Type `recon ingest "
-                f"{named}`, or give several that show one room.")
+                f"{list_names([path.name for path in videos])}. Type "
+                f"{name_command(f'ingest {named}')}, or give several that show one room.")
     return ("Give a video file, or a folder with photos of one room (JPEG, PNG, TIFF, WebP, HEIC, "
             "camera RAW).")
 

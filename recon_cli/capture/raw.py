@@ -15,12 +15,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
 from recon_cli.capture.dng_corrections import Warp, correct_shading, read_corrections, turn
+from recon_cli.capture.frame_measures import shrink
 from recon_cli.capture.images import Photo, check_size, open_raw
 from recon_cli.capture.raw_exposure import RawMeasures, exposures, measure_view, nominal_ev
 from recon_cli.capture.unreadable import unreadable_error
@@ -198,10 +198,7 @@ def _measure(path: Path, shared: CameraSettings) -> RawMeasures:
             output_color=rawpy.ColorSpace.raw, output_bps=16)
     linear = wide.astype(np.float32) / 65535
     clipped = (linear.max(axis=2) >= SATURATED).astype(np.float32)
-    scale = min(1.0, LOOK_PIXELS / max(linear.shape[:2]))
-    small, touched = (
-        cv2.resize(plane, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        for plane in (linear, clipped))
+    small, touched = (shrink(plane, LOOK_PIXELS) for plane in (linear, clipped))
     return measure_view(small, touched > 0)
 
 

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from recon_cli.capture.limits import MAX_RATIO, MOST_FEATURES
+
 # Standard deviation of the difference that a pair gives, over 77 pairs of 40 photos of a desk.
 PAIR_EV = 0.022
 # Beyond this, EXIF is rejected. Light that changed by itself (a phone's own exposure left in
@@ -24,14 +26,12 @@ DOUBT_EV = 0.5
 MIN_WITNESSES = 2  # pairs needed to reject an EXIF value
 LOOSE_EV = 3.0  # keeps photos of unknown exposure near the others
 REACH = 4  # each photo is compared with so many that follow
-FEATURES = 1500  # the strongest: pairs of neighbours then share hundreds, at 20 ms a pair
 PIXELS_KEPT = 20_000  # of each photo, enough for a percentile
 MIN_DISTINCT = 20  # below this, repeated things can agree on a geometry by chance
 EPIPOLAR_PIXELS = 1.5  # of the small view: room for a lens that is not undistorted
 # Between the quartiles of a pair's ratios: at most 0.43 EV over 40 pairs of a rendered room that
 # overlap well, at least 0.6 EV, mostly above 1, over the 14 whose matches were chance.
 AGREED_EV = 0.5
-RATIO = 0.8  # Lowe, IJCV 2004, section 7.1
 # Linear values, as shares of saturation, between which noise and clipping do not distort a ratio.
 DARK, BRIGHT = 0.004, 0.9
 
@@ -58,7 +58,7 @@ def measure_view(
     clipped: NDArray[np.bool_],  # [h, w], where a channel is saturated
 ) -> RawMeasures:
     """Returns the measures of a view."""
-    keys, sift = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(_visible(linear), None)
+    keys, sift = cv2.SIFT.create(nfeatures=MOST_FEATURES).detectAndCompute(_visible(linear), None)
     descriptors = np.empty((0, 128), np.uint8) if sift is None else sift.astype(np.uint8)
     brightest = np.where(clipped, np.inf, linear.max(axis=2)).astype(np.float32).ravel()
     sample = np.linspace(0, len(brightest) - 1, min(PIXELS_KEPT, len(brightest))).astype(int)
@@ -158,7 +158,8 @@ def _matches(
         return none
     nearest = cv2.BFMatcher().knnMatch(
         first.descriptors.astype(np.float32), second.descriptors.astype(np.float32), k=2)
-    distinct = [(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < RATIO * n.distance]
+    distinct = [
+        (m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < MAX_RATIO * n.distance]
     if len(distinct) < MIN_DISTINCT:
         return none
     at, matched = np.array(distinct, np.int64).T

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.limits import MIN_TRACKS
 from recon_cli.io.tracks import Tracks
 
 # Shift between two frames as a share of the longer side, a third of a pixel at the tracker's size.
@@ -16,7 +17,6 @@ from recon_cli.io.tracks import Tracks
 # (tests/bench/bench_capture_bounds.py); at a third of those rates codecs move them by up to .7. A
 # camera that is walked through a room moves .4 to 20 pixels from frame to frame.
 SAME_PICTURE = 0.0005
-MIN_SHARED = 8  # fewer corners agree by chance
 FEW = 0.1  # of the corners, those that move unlike the others: lost ones, and people
 
 
@@ -32,7 +32,7 @@ def find_stills(tracks: Tracks, width: int, height: int) -> NDArray[np.int64]:
     for image in range(1, len(stills)):
         before, now = tracks.matches(first, image)
         start, end = tracks.xy[before] * sides, tracks.xy[now] * sides
-        same = len(now) >= MIN_SHARED and measure_shift(start, end) < SAME_PICTURE
+        same = len(now) >= MIN_TRACKS and measure_shift(start, end) < SAME_PICTURE
         stills[image] = stills[image - 1] + (not same)
         if not same:
             first = image

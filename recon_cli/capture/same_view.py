@@ -19,6 +19,7 @@ from scipy.optimize import isotonic_regression
 from scipy.stats import rankdata
 
 from recon_cli.capture.frame_measures import measure_exposure, measure_sharpness
+from recon_cli.capture.limits import CLIPPED_SHARE
 
 SIDE = 64  # pixels of a reduced photo
 # Distance of two signatures, or what a curve leaves, below which two photos are one view. A picture
@@ -29,7 +30,6 @@ SAME_VIEW = 0.05
 EXPLAINED = 0.5
 # Of 255: beyond these a sensor or a file keeps no differences, and no curve brings them back.
 DARKEST, BRIGHTEST = 4, 252
-MOST_CLIPPED = 0.02  # of the pixels that are averaged, for their mean to lie on the curve
 LEAST_COMMON = 0.05  # of the reduced photo, clipped in neither
 # Correlation by rank of two reduced photos: only above it a curve is fitted, which takes a
 # millisecond. Brackets of which three quarters are clipped reach .75.
@@ -63,7 +63,7 @@ def measure_photo(rgb: NDArray[np.uint8]) -> PhotoMeasures:
     ranks -= ranks.mean()
     return PhotoMeasures(
         signature(gray), measure_exposure(gray), measure_sharpness(gray),
-        np.asarray(small, np.float64), np.asarray(share > MOST_CLIPPED),
+        np.asarray(small, np.float64), np.asarray(share > CLIPPED_SHARE),
         ranks / (np.linalg.norm(ranks) or 1.0))
 
 

@@ -21,7 +21,7 @@ from recon_cli.capture.lens_border import BorderMeter
 from recon_cli.capture.static_overlay import OverlayMeter
 from recon_cli.capture.tracker import Tracker
 from recon_cli.capture.video_colour import WIDE_GAMUTS
-from recon_cli.errors import InputError
+from recon_cli.errors import Hint, InputError
 from recon_cli.io.tracks import Tracks
 from recon_cli.workspace import atomic
 
@@ -140,7 +140,7 @@ def measure_scene(
             step()
     if len(motion) != len(scan.motion):
         raise InputError(
-            f"{path} has changed while it was read.", hint="Run `recon ingest` again.")
+            f"{path} has changed while it was read.", hint=Hint("ingest", then=" again"))
     return replace(scan, sharpness=np.array(sharpness), motion=np.array(motion))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from recon_cli.capture import video
 from recon_cli.capture.decoded_picture import DecodedPicture, Packing, read_side_data
+from recon_cli.capture.limits import SAME_SHAPE
 from recon_cli.capture.panoramas import wraps_around
 from recon_cli.capture.two_views import find_two_views, has_two_circles
 from recon_cli.errors import InputError
@@ -19,8 +20,7 @@ from recon_cli.errors import InputError
 _PROJECTIONS = {
     0: "equirectangular", 1: "cubemap", 2: "equirectangular tile", 3: "half equirectangular",
     5: "fisheye", 6: "parametric immersive"}
-# Frames that are looked at, and how many of them must wrap around.
-_LOOKED_AT, _EVERY, _LEAST = 5, 40, 3
+_LOOKED_AT, _EVERY = 5, 40  # frames by which a video is judged, and from one to the next
 # What cameras with two fisheye lenses write, and who stitches that.
 _STITCHERS = {
     ".insv": "Insta360 Studio", ".360": "GoPro Player", ".osv": "DJI Studio"}
@@ -85,7 +85,7 @@ def is_spherical(
             "equirectangular.",
             hint="Export it as equirectangular with the app of the camera.")
     if projection or camera == "equirectangular":
-        if abs(width / height / 2 - 1) > 0.02:
+        if abs(width / height / 2 - 1) > SAME_SHAPE:
             raise InputError(
                 f"{path} has {width}x{height} pixels; a panorama is twice as wide as high.",
                 hint="Export it as a full 360-degree video, or give --camera perspective.")
@@ -95,7 +95,7 @@ def is_spherical(
     chosen = {index for index in range(0, _LOOKED_AT * _EVERY, _EVERY) if index < frames}
     around = [wraps_around(rgb) for _, rgb in video.frames_at(
         path, chosen, threads=1, size=size)]
-    return sum(around) >= min(_LEAST, len(around))
+    return 2 * sum(around) > len(around)
 
 
 def read_projection(path: Path) -> str:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.frame_measures import shrink
 from recon_cli.io.images import read_image, write_png
 
 PICTURE = "overlay.png"  # a frame with the masked area in red
@@ -28,10 +29,9 @@ SOFT_EDGE = 2.0
 # lost or moved by this share of the longer side, which takes edges of 2 to 3 pixels 19 pixels on.
 MOVED, STILL = 0.04, 0.5
 MIN_VIEWS = 20  # edges of fewer views agree by chance
-MIN_CONTRAST = 8.0  # standard deviation of the gray values; darker views show no overlay either
 MAX_PARTS = 8  # of the video in which the edges are added up, at 1 MB each
-# Gray values. Where only noise changes, three quarters of the pixels vary by less; in walks they do
-# by 41 to 85, before a bare wall by 4.
+# Standard deviation of gray values, over a view and over time. Where only noise changes, three
+# quarters of the pixels vary by less; in walks they do by 41 to 85, before a bare wall by 4.
 MIN_SPREAD = 8.0
 # From this `OverlayMeter.strength` on an edge is static; chance alone gives some / sqrt(views).
 # The 12th strongest pixel, times sqrt(views): 1.0 to 2.1 in 17 captures, 3.8 at a strength of .24
@@ -73,15 +73,11 @@ class OverlayMeter:
         if self.views and not self._has_moved(gray.shape, numbers, corners):
             return
         self._numbers, self._corners = numbers, corners
-        scale = SIZE / max(gray.shape)
-        if scale < 1:
-            gray = np.asarray(cv2.resize(
-                gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-        values = gray.astype(np.float32)
-        if values.std() < MIN_CONTRAST:
+        values = shrink(gray, SIZE).astype(np.float32)
+        if values.std() < MIN_SPREAD:  # a darker view shows no overlay either
             return
         if not self.views:
-            self._gray = np.zeros((2, *gray.shape), np.float32)
+            self._gray = np.zeros((2, *values.shape), np.float32)
         smooth = cv2.GaussianBlur(values, (0, 0), SMOOTH)
         # Scharr's weights add up to 32 gray values for a slope of one a pixel.
         across, down = (

@@ -13,13 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-SIZE = 640  # pixels of the longer side
-FEATURES = 1500  # of a picture
-RATIO = 0.8  # of the distances to the best and the second best feature (Lowe 2004)
+from recon_cli.capture.frame_measures import shrink
+from recon_cli.capture.limits import MAX_RATIO, MIN_MATCHES, MOST_FEATURES, TRACK_SIZE
+
 REACH = 2.0  # pixels between a feature and the epipolar line of its match
-# Matches that agree with one epipolar geometry, as COLMAP asks for. Of 3,200 pairs of pictures of
-# two scenes none had more than 13.
-AGREEING = 15
 MOST_COMPARED = 80  # pictures that one is compared with, spread evenly
 
 # The gray values [H, W] of a picture by index; None where it cannot be read.
@@ -45,7 +42,7 @@ def find_strangers(suspects: Collection[int], others: Collection[int], read: Rea
         known = dict.fromkeys([*nearest[:4], *nearest[::max(1, len(nearest) // MOST_COMPARED)]])
         own = features(suspect)
         if own is not None and not any(
-                (other := features(index)) is not None and count_agreeing(own, other) >= AGREEING
+                (other := features(index)) is not None and count_agreeing(own, other) >= MIN_MATCHES
                 for index in known):
             strangers.append(suspect)
     return strangers
@@ -53,11 +50,8 @@ def find_strangers(suspects: Collection[int], others: Collection[int], read: Rea
 
 def find_features(gray: NDArray[np.uint8]) -> _Features:
     """Returns the SIFT features of a picture [H, W]."""
-    scale = SIZE / max(gray.shape)
-    if scale < 1:
-        gray = np.asarray(cv2.resize(
-            gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-    keypoints, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(gray, None)
+    keypoints, descriptors = cv2.SIFT.create(MOST_FEATURES).detectAndCompute(
+        shrink(gray, TRACK_SIZE), None)
     if descriptors is None:
         descriptors = np.zeros((0, 128), np.float32)
     return _Features(
@@ -70,7 +64,7 @@ def match_features(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Returns the places [M, 2] of matching features in two pictures of two features or more."""
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-    good = [best for best, next_best in pairs if best.distance < RATIO * next_best.distance]
+    good = [best for best, next_best in pairs if best.distance < MAX_RATIO * next_best.distance]
     good = list({match.trainIdx: match for match in good}.values())
     return (first.xy[[match.queryIdx for match in good]],
             second.xy[[match.trainIdx for match in good]])
@@ -78,10 +72,10 @@ def match_features(
 
 def count_agreeing(first: _Features, second: _Features) -> int:
     """Returns how many features of two pictures match under one epipolar geometry."""
-    if min(len(first.xy), len(second.xy)) < AGREEING:
+    if min(len(first.xy), len(second.xy)) < MIN_MATCHES:
         return 0
     start, end = match_features(first, second)
-    if len(start) < AGREEING:
+    if len(start) < MIN_MATCHES:
         return 0
     _, inside = cv2.findFundamentalMat(start, end, cv2.FM_RANSAC, REACH, 0.999, 2000)
     return 0 if inside is None else int(inside.sum())

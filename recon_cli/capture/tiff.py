@@ -10,30 +10,52 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping
+from enum import IntEnum
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, TiffImagePlugin
+from PIL import Image, TiffImagePlugin, TiffTags
+from PIL.ExifTags import Base as Tag
 
-# TIFF 6.0, sections 8, 14, 15, 18 and 19.
-WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC = 256, 257, 258, 259, 262
-STRIP_OFFSETS, SAMPLES, STRIP_COUNTS, PLANAR = 273, 277, 279, 284
-PREDICTOR, TILE_WIDTH, TILE_OFFSETS, TILE_COUNTS = 317, 322, 324, 325
-EXTRA_SAMPLES, SAMPLE_FORMAT = 338, 339
-COPIED = (LENGTH, COMPRESSION, 266, 278, 323)  # of a picture's bytes: fill order, rows, tile length
-APART, DIFFERENCES = 2, 2  # values of PLANAR and PREDICTOR
-FLOAT = 3  # of SAMPLE_FORMAT
-WHITE_IS_ZERO, CMYK = 0, 5  # of PHOTOMETRIC
-COLOURS = {WHITE_IS_ZERO: 1, 1: 1, 2: 3, CMYK: 4}  # samples of a colour
-ASSOCIATED, UNASSOCIATED = 1, 2  # of EXTRA_SAMPLES, the opacity; any other is not
-JPEG_XL = 52546  # of COMPRESSION, in DNG 1.7
-SUB_DIRECTORIES = 330  # TIFF/EP: the pictures of a RAW file beside a small one
-LONG, LONG8 = 4, 16  # types of values in files below 4 GiB, and in BigTIFF
-BIG = 43
-WHITE = 65535
+# The tags of a picture's bytes that a directory of grays shares with the picture.
+COPIED = (Tag.ImageLength, Tag.Compression, Tag.FillOrder, Tag.RowsPerStrip, Tag.TileLength)
+WHITE = int(np.iinfo(np.uint16).max)
+
+
+class Photometric(IntEnum):
+    """What samples mean: TIFF 6.0, sections 8 and 16, and DNG 1.7."""
+
+    WHITE_IS_ZERO = 0
+    BLACK_IS_ZERO = 1
+    RGB = 2
+    CMYK = 5
+    MOSAIC = 32803
+    LINEAR = 34892
+
+
+class Extra(IntEnum):
+    """Extra samples that are opacity (TIFF 6.0, section 18), which colours were multiplied by."""
+
+    ASSOCIATED = 1
+    UNASSOCIATED = 2
+
+
+class TagValue(IntEnum):
+    """Other values of tags: TIFF 6.0, sections 8, 14 and 19, BigTIFF, and DNG 1.7."""
+
+    PLANES_APART = 2  # of the planar configuration
+    DIFFERENCES = 2  # of the predictor
+    FLOAT = 3  # of the sample format
+    BIG = 43  # the version of BigTIFF
+    JPEG_XL = 52546  # of the compression
+
+
+_COLOURS: dict[int, int] = {
+    Photometric.WHITE_IS_ZERO: 1, Photometric.BLACK_IS_ZERO: 1, Photometric.RGB: 3,
+            Photometric.CMYK: 4}  # samples of a colour
 
 
 class UnsupportedError(ValueError):
@@ -43,23 +65,23 @@ class UnsupportedError(ValueError):
 def is_misread(image: Image.Image) -> bool:
     """Returns whether a file is a TIFF that Pillow opens, but loses samples of."""
     tags = getattr(image, "tag_v2", {})
-    apart = tags.get(PLANAR) == APART and EXTRA_SAMPLES in tags
-    return apart or (16 in tags.get(BITS, ()) and image.mode != "I")  # "I" is signed
+    apart = tags.get(Tag.PlanarConfiguration) == TagValue.PLANES_APART and Tag.ExtraSamples in tags
+    return apart or (16 in tags.get(Tag.BitsPerSample, ()) and image.mode != "I")  # "I" is signed
 
 
 def read_tiff(path: Path, image: Image.Image) -> NDArray[np.uint16]:
     """Returns the pixels of a TIFF file as stored: RGB or RGBA, [H, W, 3 or 4], up to 65535."""
     tags: Mapping[int, Any] = image.tag_v2  # type: ignore[attr-defined]
-    kind, samples = tags.get(PHOTOMETRIC, 1), tags.get(SAMPLES, 1)
-    wanted, bits = COLOURS.get(kind, 0), tags.get(BITS, (1,))
+    kind, samples = tags.get(Tag.PhotometricInterpretation, 1), tags.get(Tag.SamplesPerPixel, 1)
+    wanted, bits = _COLOURS.get(kind, 0), tags.get(Tag.BitsPerSample, (1,))
     if not 0 < wanted <= samples or set(bits) not in ({8}, {16}) or set(
-            tags.get(SAMPLE_FORMAT, (1,))) != {1}:
+            tags.get(Tag.SampleFormat, (1,))) != {1}:
         raise UnsupportedError(describe(tags))
     values = _read_samples(path.read_bytes(), tags, samples)
     if values.dtype == np.uint8:
         values = values * np.uint16(WHITE // 255)
     # without the tag one more sample is opacity, as for Pillow
-    extra = tags.get(EXTRA_SAMPLES, (UNASSOCIATED,) if samples == wanted + 1 else ())
+    extra = tags.get(Tag.ExtraSamples, (Extra.UNASSOCIATED,) if samples == wanted + 1 else ())
     return _to_rgba(values, kind, extra)
 
 
@@ -67,7 +89,7 @@ def read_directories(path: Path) -> Iterator[Mapping[int, Any]]:
     """Yields the tags of the first picture of a file like a TIFF, and of those below it."""
     with path.open("rb") as file:
         head = file.read(8)
-        head += file.read(8) if BIG in head[2:4] else b""
+        head += file.read(8) if TagValue.BIG in head[2:4] else b""
         tags = TiffImagePlugin.ImageFileDirectory_v2(head)
         places = [tags.next]
         for place in places:  # those below the first are added while it goes
@@ -75,30 +97,31 @@ def read_directories(path: Path) -> Iterator[Mapping[int, Any]]:
             file.seek(place)
             tags.load(file)
             if len(places) == 1:
-                below = tags.get(SUB_DIRECTORIES, ())
+                below = tags.get(Tag.SubIFDs, ())
                 places += below if isinstance(below, tuple) else (below,)
             yield tags
 
 
 def describe(tags: Mapping[int, Any]) -> str:
     """Returns the reason why the samples of a TIFF file are not read."""
-    number = "floating point" if FLOAT in tags.get(SAMPLE_FORMAT, ()) else "integer"
-    bits = "/".join(str(value) for value in sorted(set(tags.get(BITS, (1,)))))
-    return (f"its pixels are {tags.get(SAMPLES, 1)} {number} samples of {bits} bits (compression "
-            f"{tags.get(COMPRESSION, 1)}, photometric interpretation {tags.get(PHOTOMETRIC, 1)}), "
-            "which is not supported")
+    number = "floating point" if TagValue.FLOAT in tags.get(Tag.SampleFormat, ()) else "integer"
+    bits = "/".join(str(value) for value in sorted(set(tags.get(Tag.BitsPerSample, (1,)))))
+    samples, compression, kind = (tags.get(tag, 1) for tag in (
+        Tag.SamplesPerPixel, Tag.Compression, Tag.PhotometricInterpretation))
+    return (f"its pixels are {samples} {number} samples of {bits} bits (compression "
+            f"{compression}, photometric interpretation {kind}), which is not supported")
 
 
 def _read_samples(data: bytes, tags: Mapping[int, Any], samples: int) -> NDArray[Any]:
     """Returns all samples, [H, W, samples], of 8 or 16 bits."""
-    if tags.get(PLANAR) == APART:
+    if tags.get(Tag.PlanarConfiguration) == TagValue.PLANES_APART:
         return np.stack([_read_gray(data, tags, plane=at, planes=samples)
                          for at in range(samples)], axis=2)
     rows = _read_gray(data, tags, columns=samples)
     values = rows.reshape(len(rows), -1, samples)
-    if samples > 1 and tags.get(PREDICTOR) == DIFFERENCES:
-        step = tags.get(TILE_WIDTH, tags[WIDTH])
-        for start in range(0, tags[WIDTH], step):
+    if samples > 1 and tags.get(Tag.Predictor) == TagValue.DIFFERENCES:
+        step = tags.get(Tag.TileWidth, tags[Tag.ImageWidth])
+        for start in range(0, tags[Tag.ImageWidth], step):
             part = values[:, start:start + step]
             part[:] = np.cumsum(part, axis=1, dtype=part.dtype)
     return values
@@ -108,15 +131,18 @@ def _read_gray(
     data: bytes, tags: Mapping[int, Any], *, columns: int = 1, plane: int = 0, planes: int = 1,
 ) -> NDArray[Any]:
     """Returns a plane of several, or rows of so many columns a pixel, [H, columns * W]."""
-    entries = {tag: (tags[tag],) for tag in COPIED if tag in tags}
-    entries |= {tag: (tags[tag] * columns,) for tag in (WIDTH, TILE_WIDTH) if tag in tags}
-    for tag in (STRIP_OFFSETS, STRIP_COUNTS, TILE_OFFSETS, TILE_COUNTS):
+    entries: dict[int, tuple[int, ...]] = {tag: (tags[tag],) for tag in COPIED if tag in tags}
+    entries |= {
+        tag: (tags[tag] * columns,) for tag in (Tag.ImageWidth, Tag.TileWidth) if tag in tags}
+    for tag in (Tag.StripOffsets, Tag.StripByteCounts, Tag.TileOffsets, Tag.TileByteCounts):
         if tag in tags:
             count = len(tags[tag]) // planes
             entries[tag] = tags[tag][plane * count:(plane + 1) * count]
     # between columns of one pixel there are no differences
-    predictor = tags.get(PREDICTOR, 1) if columns == 1 else 1
-    entries |= {BITS: (max(tags[BITS]),), PHOTOMETRIC: (1,), SAMPLES: (1,), PREDICTOR: (predictor,)}
+    predictor = tags.get(Tag.Predictor, 1) if columns == 1 else 1
+    entries |= {
+        Tag.BitsPerSample: (max(tags[Tag.BitsPerSample]),), Tag.Predictor: (predictor,),
+        Tag.PhotometricInterpretation: (Photometric.BLACK_IS_ZERO,), Tag.SamplesPerPixel: (1,)}
     with Image.open(BytesIO(_with_directory(data, entries)), formats=("TIFF",)) as gray:
         pixels = np.asarray(gray)
     return pixels.astype(np.uint8 if pixels.itemsize == 1 else np.uint16)
@@ -125,8 +151,8 @@ def _read_gray(
 def _with_directory(data: bytes, entries: Mapping[int, tuple[int, ...]]) -> bytes:
     """Returns a TIFF file with another directory of its first picture, at its end."""
     order = "<" if data[:2] == b"II" else ">"
-    big = struct.unpack_from(f"{order}H", data, 2) == (BIG,)
-    number, kind, size, head = ("Q", LONG8, 8, 8) if big else ("I", LONG, 4, 4)
+    big = struct.unpack_from(f"{order}H", data, 2) == (TagValue.BIG,)
+    number, kind, size, head = ("Q", TiffTags.LONG8, 8, 8) if big else ("I", TiffTags.LONG, 4, 4)
     start = len(data) + len(data) % 2
     table, values = struct.pack(f"{order}{'Q' if big else 'H'}", len(entries)), b""
     behind = start + len(table) + len(entries) * (4 + 2 * size) + size
@@ -147,19 +173,19 @@ def _to_rgba(
     values: NDArray[np.uint16], kind: int, extra: tuple[int, ...]
 ) -> NDArray[np.uint16]:
     """Returns samples [H, W, S] as RGB, and the opacity where an extra sample holds it."""
-    colours = COLOURS[kind]
+    colours = _COLOURS[kind]
     rgb = values[..., :colours]
-    if kind == WHITE_IS_ZERO:
+    if kind == Photometric.WHITE_IS_ZERO:
         rgb = WHITE - rgb
-    elif kind == CMYK:  # of inks as Pillow takes them
+    elif kind == Photometric.CMYK:  # of inks as Pillow takes them
         light = WHITE - rgb.astype(np.uint32)
         rgb = ((light[..., :3] * light[..., 3:] + WHITE // 2) // WHITE).astype(np.uint16)
     rgb = np.broadcast_to(rgb, (*values.shape[:2], 3))
-    alphas = [at for at, role in enumerate(extra) if role in (ASSOCIATED, UNASSOCIATED)]
+    alphas = [at for at, role in enumerate(extra) if role in (Extra.ASSOCIATED, Extra.UNASSOCIATED)]
     if not alphas or values.shape[2] <= colours + alphas[0]:
         return np.ascontiguousarray(rgb)
     alpha = values[..., colours + alphas[0], None]
-    if extra[alphas[0]] == ASSOCIATED:  # the colours were multiplied by it
+    if extra[alphas[0]] == Extra.ASSOCIATED:  # the colours were multiplied by it
         part = rgb.astype(np.uint32) * WHITE // np.maximum(alpha, 1)
         rgb = np.minimum(part, WHITE).astype(np.uint16)
     return np.concatenate([rgb, alpha], axis=2)

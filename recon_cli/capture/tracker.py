@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.capture.frame_measures import shrink
+from recon_cli.capture.limits import RETURN_ERROR, TRACK_SIZE, WINDOW
 from recon_cli.io.tracks import Tracks
 
-TRACK_SIZE = 640  # pixels of the longer side of a frame
 # A cell of this many pixels holds a corner, its best one: plain walls get what they have, too.
 CELL = 20
 # Smallest eigenvalue (Shi and Tomasi) of a corner over 7 x 7 pixels. A tenth of it doubled the
@@ -21,24 +22,23 @@ MIN_EIGENVALUE, BLOCK = 1e-4, 7
 # New corners are searched for when fewer than this share of those after the last search are left,
 # and after so many frames at the latest: what comes to light pushes no corner out of view.
 TOP_UP, EVERY = 0.6, 5
-WINDOW, LEVELS = (15, 15), 4  # 4 pyramid levels follow fast turns: 1.4 times the tracks that 3 keep
+LEVELS = 4  # of the pyramid follow fast turns: 1.4 times the tracks that 3 keep
 BACK_LEVELS = 1  # the way back starts where it should end
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.03)
 # Mean difference of the gray values in a window. 90% of the corners of four videos stay below 6 to
 # 16; of the few that find something alike beyond a cut, half are above it.
 MAX_DIFFERENCE = 25.0
-RETURN_ERROR = 1.0  # pixels between a corner and where following it there and back ends
 MARGIN = 3  # pixels at the border, where windows are cut off
 MERGED = 4  # pixels; of two tracks in one cell of this size the older is kept
 # Exposure changes from frame to frame; contrast by areas takes that off (CLAHE).
-CLIP_LIMIT, AREAS = 2.0, (8, 8)
+CLIP_LIMIT = 2.0
 
 
 class Tracker:
     """Takes the gray frames of a video one by one."""
 
     def __init__(self) -> None:
-        self._equalise = cv2.createCLAHE(CLIP_LIMIT, AREAS)
+        self._equalise = cv2.createCLAHE(CLIP_LIMIT)
         self._last: NDArray[np.uint8] | None = None
         self._corners = np.zeros((0, 2), np.float32)
         self._numbers = np.zeros(0, np.int32)  # sorted, as new ones come last
@@ -48,11 +48,7 @@ class Tracker:
 
     def advance(self, gray: NDArray[np.uint8]) -> None:
         """Follows the corners into the next frame, [H, W]; all frames are of one size."""
-        scale = TRACK_SIZE / max(gray.shape)
-        if scale < 1:
-            gray = np.asarray(cv2.resize(
-                gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-        gray = np.asarray(self._equalise.apply(gray), np.uint8)
+        gray = np.asarray(self._equalise.apply(shrink(gray, TRACK_SIZE)), np.uint8)
         if self._last is not None and len(self._corners):
             self._follow(self._last, gray)
         if len(self._seen) % EVERY == 0 or len(self._corners) < TOP_UP * self._full:

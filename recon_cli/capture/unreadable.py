@@ -7,15 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 
 import rawpy
-from PIL import UnidentifiedImageError
+from PIL import ExifTags, UnidentifiedImageError
 
-from recon_cli.capture.tiff import (
-    COMPRESSION,
-    JPEG_XL,
-    UnsupportedError,
-    describe,
-    read_directories,
-)
+from recon_cli.capture.tiff import TagValue, UnsupportedError, describe, read_directories
 from recon_cli.errors import InputError
 
 # What Pillow and pillow_heif raise on damaged files; OSError includes unidentified ones.
@@ -43,7 +37,8 @@ def _describe_coding(path: Path, error: Exception) -> tuple[str, str]:
     """Returns why no library knows a picture that is not damaged, and a hint; else ""."""
     with suppress(*BROKEN):
         if isinstance(error, rawpy.LibRawFileUnsupportedError) and any(
-                tags.get(COMPRESSION) == JPEG_XL for tags in read_directories(path)):
+                tags.get(ExifTags.Base.Compression) == TagValue.JPEG_XL
+                for tags in read_directories(path)):
             return ("its pixels are compressed by JPEG XL, which LibRaw does not decode",
                     "It is not damaged: let the camera or Adobe DNG Converter write DNG without "
                     "JPEG XL, or save it as JPEG or TIFF.")

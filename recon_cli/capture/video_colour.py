@@ -11,28 +11,32 @@ H.273 and a power for its curve.
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 from functools import cache
 
 import cv2
 import numpy as np
+from av.video.reformatter import ColorPrimaries, ColorTrc
 from numpy.typing import NDArray
 
 # cd/m2: the nominal peak of HLG (BT.2100, table 5), and what phones and films master PQ for.
 PEAK = 1000.0
 # cd/m2: white of a page in HDR (BT.2408, table 1); it is the brightest that SDR can show.
 SDR_WHITE = 203.0
-HLG_GAMMA = 1.2  # BT.2100, table 5: of the OOTF at 1000 cd/m2
+HLG_GAMMA = 1.2 + 0.42 * math.log10(PEAK / 1000)  # BT.2100, table 5: of the OOTF
 # BT.2100, table 5: the OETF of HLG.
 HLG_A = 0.17883277
 HLG_B, HLG_C = 1 - 4 * HLG_A, 0.5 - HLG_A * np.log(4 * HLG_A)
 # BT.2100, table 4: the EOTF of PQ.
 PQ_M1, PQ_M2 = 2610 / 16384, 2523 / 4096 * 128
-PQ_C1, PQ_C2, PQ_C3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+PQ_C2, PQ_C3 = 2413 / 4096 * 32, 2392 / 4096 * 32
+PQ_C1 = PQ_C3 - PQ_C2 + 1
 # CIE x, y of R, G, B by the code of ITU-T H.273: BT.709, BT.2020 and P3; white is D65 in all. The
-# white of DCI P3 (11) is that of projectors, which a display adapts to its own.
-BT709, BT2020, DCI_P3, P3 = 1, 9, 11, 12
-PRIMARIES = {
+# white of DCI P3 is that of projectors, which a display adapts to its own.
+BT709, BT2020 = ColorPrimaries.BT709, ColorPrimaries.BT2020
+DCI_P3, P3 = ColorPrimaries.SMPTE431, ColorPrimaries.SMPTE432
+PRIMARIES: dict[int, tuple[tuple[float, float], ...]] = {
     BT709: ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06)),
     BT2020: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
     P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))}
@@ -40,7 +44,7 @@ PRIMARIES[DCI_P3] = PRIMARIES[P3]
 # Adobe RGB (1998) Color Image Encoding, 4.3.1: beyond the codes of H.273, which are bytes.
 ADOBE_RGB, ADOBE_GAMMA = 256, 563 / 256
 PRIMARIES[ADOBE_RGB] = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))
-WIDE_GAMUTS = {
+WIDE_GAMUTS: dict[int, str] = {
     BT2020: "BT.2020", DCI_P3: "P3", P3: "Display P3", ADOBE_RGB: "Adobe RGB"}
 D65 = (0.3127, 0.3290)
 # Steps of the gain over the root of the light: neighbours differ by less than 0.2 %.
@@ -57,7 +61,13 @@ class Transfer(Enum):
     PQ = "PQ"
 
 
-TRANSFERS = {16: Transfer.PQ, 18: Transfer.HLG}  # by the code of H.273, table 3
+TRANSFERS: dict[int, Transfer] = {
+    ColorTrc.SMPTE2084: Transfer.PQ, ColorTrc.ARIB_STD_B67: Transfer.HLG}
+
+
+def full_range_white(bits: int) -> int:
+    """Returns the white of full range at 16 bits: n bits end at 2^n - 1 of 2^n."""
+    return 65536 - (1 << 16 - bits)
 
 
 def pq_light(signal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,21 +5,22 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from PIL import Image
+from PIL import ExifTags, Image
 
-TAG = 700  # of TIFF: XMP specification, part 3
+from recon_cli.capture.limits import SAME_SHAPE
+
 # Google's Photo Sphere, as elements or as attributes.
 _VALUE = rb"""(?:>|\s*=\s*["'])\s*"""
 _PROJECTION = re.compile(rb"GPano:ProjectionType" + _VALUE + rb"([A-Za-z]+)")
 _AREA = {name: re.compile(rb"GPano:" + name.encode() + _VALUE + rb"(\d{1,7})") for name in (
     "CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels", "FullPanoWidthPixels",
     "FullPanoHeightPixels", "CroppedAreaLeftPixels", "CroppedAreaTopPixels")}
-_ASPECT = 0.02  # a picture reduced to whole pixels keeps its aspect this well
 
 
 def read_xmp(image: Image.Image) -> bytes:
     """Returns the XMP of a picture; empty where there is none."""
-    value = image.info.get("xmp") or getattr(image, "tag_v2", {}).get(TAG) or b""
+    value = image.info.get("xmp") or getattr(image, "tag_v2", {}).get(
+        ExifTags.Base.XMLPacket) or b""
     if isinstance(value, str):
         return value.encode(errors="replace")
     return value if isinstance(value, bytes) else b""  # numbers, in a TIFF of a wrong type
@@ -35,7 +36,7 @@ def is_panorama(xmp: bytes, width: int, height: int) -> bool:
         return False
     sides = _find(xmp, "CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels")
     wanted = sides[0] / sides[1] if all(sides) else 2.0
-    return abs(width / height / wanted - 1) <= _ASPECT
+    return abs(width / height / wanted - 1) <= SAME_SHAPE
 
 
 @dataclass(frozen=True)

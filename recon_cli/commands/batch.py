@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.jobs import open_executor
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings
@@ -82,11 +83,11 @@ def batch(
     from recon_cli.report.batch_page import batch_text, write_batch_page
 
     page = write_batch_page(results, out)
-    click.echo(batch_text(results))
-    click.echo(f"The page of this table is {page}")
+    say(batch_text(results))
+    say(f"The page of this table is {page}")
     done = [result.capture for result in results if result.succeeded]
     if done:
-        click.echo(f"next:    recon view -w {shlex.quote(str(out / done[0]))}")
+        say(f"next:    recon view -w {shlex.quote(str(out / done[0]))}")
     failed = {result.capture: result.reason for result in results if not result.succeeded}
     if failed:
         raise ReconstructionError(
@@ -99,7 +100,7 @@ def _report(result: CaptureResult) -> None:
     with hide_bars():
         if result.succeeded:
             score = "" if result.psnr_db is None else f"{result.psnr_db:.2f} dB, "
-            click.echo(f"{result.capture}: {score}{result.gaussians or 0:,} Gaussians "
+            say(f"{result.capture}: {score}{result.gaussians or 0:,} Gaussians "
                        f"({format_duration(result.seconds or 0.0)})")
         else:
-            click.echo(f"{result.capture}: exit code {result.exit_code}: {result.reason}")
+            say(f"{result.capture}: exit code {result.exit_code}: {result.reason}")

@@ -11,6 +11,7 @@ import click
 from click.core import ParameterSource
 
 from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.options import Call, Command, Verb, pass_call
 from recon_cli.config import settings
 from recon_cli.config.settings import Settings
@@ -113,7 +114,7 @@ def bench(call: Call, /, **typed: Any) -> None:
     compute = settings.build(ComputeConfig, call.settings)
     from recon_cli.experiments.backends import BenchRequest, run
 
-    click.echo(run(
+    say(run(
         BenchRequest(**typed, device=compute.device, threads=compute.threads),
         TqdmProgress()).text())
 
@@ -155,7 +156,7 @@ def study(call: Call, /, scenes: SceneOptions, replica: Path | None, **typed: An
     # nothing looks at validation views here, so all but the test views are trained on
     request = StudyRequest(
         **scenes.fields(call, validation=0.0, defaults=defaults), **typed, design=design)
-    click.echo(run(request, TqdmProgress()).text())
+    say(run(request, TqdmProgress()).text())
 
 
 def _fill_paper_tables(

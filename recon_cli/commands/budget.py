@@ -20,7 +20,7 @@ from recon_cli.commands.options import Call, explicit_settings
 from recon_cli.config.settings import Settings, build, merge
 from recon_cli.config.stages import IngestConfig, TrainConfig
 from recon_cli.deadline import Clock, Deadline
-from recon_cli.errors import ReconError
+from recon_cli.errors import ReconError, name_command
 from recon_cli.sfm.mapping.time_estimate import Workload, expected_seconds, measure_slowness
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.layout import Workspace
@@ -100,7 +100,7 @@ def run_within(
         write_json(workspace.root / FILE, budget.to_json())
     if with_prune and not budget.prune:
         logger.warning("there is no time to prune in %g minutes: the scene keeps all its "
-                       "Gaussians; `recon prune` removes some", minutes)
+                       "Gaussians; %s removes some", minutes, name_command("prune"))
     stages(*["prune"] * bool(budget.prune), "evaluate", "export", frames=frames, training=training)
     if deadline.spent > _LATE * deadline.seconds:
         logger.warning("the run took %.1f minutes, more than the %g of --minutes",

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from recon_cli.commands import hints
+from recon_cli.commands.usage import suggest_command
 from recon_cli.config.stages import EvaluateConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, InputError
@@ -65,7 +65,7 @@ def _check_items(items: Sequence[Path]) -> None:
         if path.is_dir() and not Workspace(path).holds_results:
             raise InputError(
                 f"{path} is neither a workspace nor a file of Gaussians.",
-                hint=hints.suggest_command("", [str(path)]))
+                hint=suggest_command("", [str(path)]))
         if path.resolve() in resolved:
             raise ConfigError(f"{path} appears twice.", hint="Remove one of them.")
         resolved.add(path.resolve())

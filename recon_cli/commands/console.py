@@ -1,28 +1,25 @@
 """How every command talks: the log and errors on stderr, as text or JSON, and --json's object.
 
-Text for people goes to stdout as before. A record of the log may carry an `event`: progress or
-start (of a stage), of `recon_cli.progress`, or an `outcome`, of a stage that is done.
+A record of the log may carry an `event`: progress or start (of a stage), of `recon_cli.progress`,
+output (with --json, a line of `say`), or an `outcome`, of a stage that is done.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import io
 import json
 import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
 from recon_cli import progress
-from recon_cli.config.settings import GONE, SECTIONS, SUCCESSORS
 from recon_cli.errors import ExitCode
 from recon_cli.progress import hide_bars
 
@@ -44,7 +41,7 @@ class Style:
     quiet: bool = False
     log_format: str = "auto"
     as_object: bool = False  # stdout gets one JSON object and nothing else
-    output: CapturedOutput | None = None  # what stdout would have got instead
+    output: list[str] = field(default_factory=list)  # lines that stdout would have got instead
 
     @property
     def form(self) -> str:
@@ -70,9 +67,9 @@ class Failure:
 class Log(logging.StreamHandler[TextIO]):
     """Writes records on stderr in the style of the command, and keeps what --json reports."""
 
-    def __init__(self, style: Style, complete: Callable[[str], str]) -> None:
+    def __init__(self, style: Style) -> None:
         super().__init__()
-        self._style, self._complete = style, complete
+        self._style = style
         self.notices: list[str] = []
         self.outcomes: list[Outcome] = []
         self._shown: dict[str, list[float]] = {}  # when lines of each stage were written
@@ -83,7 +80,7 @@ class Log(logging.StreamHandler[TextIO]):
         if outcome:
             self.outcomes.append(outcome)
         elif record.levelno == logging.WARNING:
-            self.notices.append(self._complete(record.getMessage()))
+            self.notices.append(record.getMessage())
         if not self._is_shown(record) or not (outcome or self._has_room(record)):
             return
         with hide_bars():
@@ -110,7 +107,7 @@ class Log(logging.StreamHandler[TextIO]):
 
     def format(self, record: logging.LogRecord) -> str:
         """Returns a line of text or JSON; `notice:` stands before warnings."""
-        text = self._complete(super().format(record))
+        text = super().format(record)
         stage = getattr(record, "stage", progress.current_stage())
         if self._style.form == "json":
             return _json_line(record.created, record.levelname.lower(), stage,
@@ -145,13 +142,21 @@ def _json_line(
     return json.dumps(fields, ensure_ascii=False)
 
 
-@contextmanager
-def show_log(style: Style, *, complete: Callable[[str], str] = str) -> Iterator[Log]:
-    """Shows the log on stderr while the block runs.
+def say(text: str) -> None:
+    """Prints a text on stdout; with --json its lines go into the object, and into the log."""
+    call = click.get_current_context().ensure_object(Style)
+    if not call.as_object:
+        click.echo(text)
+        return
+    for line in text.split("\n"):
+        call.output.append(line)
+        progress.logger.info("%s", line, extra={"event": "output"})
 
-    `complete` completes the commands in messages (see `hints.name_workspace`).
-    """
-    handler = Log(style, complete)
+
+@contextmanager
+def show_log(style: Style) -> Iterator[Log]:
+    """Shows the log on stderr while the block runs."""
+    handler = Log(style)
     progress.choose_bars(lambda: style.form == "bars" and not style.quiet)
     loggers = (logger, progress.logger)
     for one in loggers:
@@ -163,23 +168,6 @@ def show_log(style: Style, *, complete: Callable[[str], str] = str) -> Iterator[
         for one in loggers:
             one.removeHandler(handler)
         progress.choose_bars()
-
-
-class CapturedOutput(io.StringIO):
-    """Stands for stdout with --json: keeps the lines, and shows each in the log."""
-
-    def write(self, text: str) -> int:
-        """Keeps the text; lines that are complete are logged."""
-        before = len(self.lines)
-        written = super().write(text)
-        for line in self.lines[before:]:
-            progress.logger.info("%s", line, extra={"event": "output"})
-        return written
-
-    @property
-    def lines(self) -> list[str]:
-        """The complete lines."""
-        return self.getvalue().split("\n")[:-1]
 
 
 def result_object(
@@ -199,50 +187,6 @@ def result_object(
              for name in outcome.manifest.outputs]
     return json.dumps({**fields, "stages": stages, "files": files, "notices": log.notices,
                        "output": output}, indent=1)
-
-
-class HintedUsageError(click.UsageError):
-    """A wrong command line, with what to type instead."""
-
-    def __init__(self, message: str, *, hint: str, ctx: click.Context | None = None) -> None:
-        super().__init__(message, ctx)
-        self.hint = hint
-
-
-def usage_hint(error: click.ClickException) -> str:
-    """Returns what to type instead, or which --help explains the verb; empty where none was."""
-    if isinstance(error, HintedUsageError):
-        return error.hint
-    if isinstance(error, click.NoSuchOption):
-        found = _gone(error) or _setting(error)
-        if found:
-            return found
-    ctx = error.ctx if isinstance(error, click.UsageError) else None
-    return f"See `{ctx.command_path} --help`." if ctx else ""
-
-
-def _gone(error: click.NoSuchOption) -> str:
-    """Returns what to do about an option that earlier versions had; empty for any other."""
-    name = error.option_name.lstrip("-").replace("-", "_")
-    section = next((each for each, fields in GONE.items() if name in fields), None)
-    if section is None:
-        return ""
-    instead = SUCCESSORS.get((section, name), "Leave it out.")
-    return f"recon no longer has {error.option_name}. {instead}"
-
-
-def _setting(error: click.NoSuchOption) -> str:
-    """Returns how an option of a stage is set in a verb that runs many; empty where it has none."""
-    if error.ctx is None or not any(
-            parameter.name == "assigned" for parameter in error.ctx.command.params):
-        return ""
-    name = error.option_name.lstrip("-").replace("-", "_")
-    sections = [section for section, config in SECTIONS.items()
-                if name in {item.name for item in dataclasses.fields(config)}]
-    if not sections:
-        return ""
-    ways = " or ".join(f"--set {section}.{name}=VALUE" for section in sections)
-    return f"{error.ctx.command_path} sets it by {ways}."
 
 
 def drop_output() -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings as layers
 from recon_cli.config.export import read_matrix
@@ -81,7 +82,7 @@ def convert(
 
     request = ConvertRequest(
         paths[:-1], paths[-1], tuple(map(_read_transform, transforms)), **changes)
-    click.echo(write(request, _context(call)).describe())
+    say(write(request, _context(call)).describe())
 
 
 @verb("info")
@@ -101,9 +102,9 @@ def info(call: Call, paths: tuple[Path, ...], as_json: bool) -> None:
         except ReconError as error:
             errors.append(error)
     if as_json:
-        click.echo(json.dumps([dataclasses.asdict(one) for one in found], indent=1))
-    else:
-        click.echo("\n\n".join(one.describe() for one in found), nl=bool(found))
+        say(json.dumps([dataclasses.asdict(one) for one in found], indent=1))
+    elif found:
+        say("\n\n".join(one.describe() for one in found))
     _raise_last(errors)
 
 

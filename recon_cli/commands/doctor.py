@@ -15,6 +15,7 @@ import psutil
 
 from recon_cli import machine
 from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.options import Call, pass_call, verb
 
 if TYPE_CHECKING:  # they import torch
@@ -29,7 +30,7 @@ if TYPE_CHECKING:  # they import torch
 def doctor(call: Call, as_json: bool) -> None:
     """Show versions, rasterizers, memory and disk."""
     findings = examine(call.workspace)
-    click.echo(json.dumps(dataclasses.asdict(findings), indent=1) if as_json
+    say(json.dumps(dataclasses.asdict(findings), indent=1) if as_json
                else findings_text(findings))
 
 

@@ -6,22 +6,20 @@ The end of a run says what was made, where it lies, how good it is, and what to 
 from __future__ import annotations
 
 import logging
-import os
-import shlex
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import click
-
 from recon_cli.api.runs import OpenWorkspace, RunRequest
+from recon_cli.commands.console import say
 from recon_cli.commands.options import Call
 from recon_cli.commands.sentences import describe_summary
 from recon_cli.config import settings as layers
 from recon_cli.config.settings import C, Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import TrainCallback
+from recon_cli.errors import command_line
 from recon_cli.jobs.executor import NEEDS_GPU, Executor, start_executor
 from recon_cli.pipeline.execute import Job, Outcome
 from recon_cli.pipeline.plan import check_parts
@@ -49,11 +47,11 @@ def run_stages(
         deadline=call.deadline)
     workspace = open_workspace(call)
     if call.print_config:
-        click.echo(layers.to_toml(workspace.resolve(request)), nl=False)
+        say(layers.to_toml(workspace.resolve(request)).removesuffix("\n"))
         return
     workspace.run(request, report_outcome)
     if list(stages) == ["evaluate"]:  # a run has more to show than its scores
-        click.echo((workspace.path / "evaluate" / "table.txt").read_text(encoding="utf-8"))
+        say((workspace.path / "evaluate" / "table.txt").read_text(encoding="utf-8"))
 
 
 def open_workspace(call: Call) -> OpenWorkspace:
@@ -117,31 +115,25 @@ def end_run(call: Call, *, open_page: bool = False) -> None:
     page = next((folder / check.manifest.run.summary["file"]
                  for check in check_parts(job, "export")
                  if check.row.part == "html" and check.manifest and check.fresh), None)
-    click.echo("")
+    say("")
     for name, path in (("scene", folder / export.file), ("page", page), ("report", report)):
         if path is not None:
-            click.echo(f"{name + ':':9}{path} ({format_megabytes(path.stat().st_size)})")
+            say(f"{name + ':':9}{path} ({format_megabytes(path.stat().st_size)})")
     place = job.workspace.manifest("place")
     ingest = job.workspace.folder("ingest")
     quality = read_quality(
         job.workspace.folder("evaluate"),
         PlaceSummary.from_json(place.run.summary) if place else None,
         read_frame_list(ingest).frames)
-    click.echo(f"quality: {name_photos(ingest)(str(quality))}")
-    click.echo(f"next:    {_next_command(call.workspace, page)}")
+    say(f"quality: {name_photos(ingest)(str(quality))}")
+    say(f"next:    {_next_command(page)}")
     if open_page:
         webbrowser.open((page or report).resolve().as_uri())
 
 
-def _next_command(workspace: Path, page: Path | None) -> str:
+def _next_command(page: Path | None) -> str:
     """Returns what to do with the results."""
     if page is None:
-        return name_workspace("recon view", workspace)
+        return command_line("view")
     return (f"open {page.name} in a browser or send it; "
-            f"{name_workspace('recon render --tour --out walk.mp4', workspace)}")
-
-
-def name_workspace(command: str, workspace: Path) -> str:
-    """Returns a command with the workspace, unless it is the one that is taken without -w."""
-    usual = Path(os.environ.get("RECON_WORKSPACE") or "workspace")
-    return command if workspace == usual else f"{command} -w {shlex.quote(str(workspace))}"
+            f"{command_line('render --tour --out walk.mp4')}")

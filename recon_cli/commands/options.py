@@ -6,7 +6,6 @@ declared once, in config/stages.py, and only typed options reach the settings.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import inspect
 import os
@@ -18,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from recon_cli.commands import hints
-from recon_cli.commands.console import LOG_FORMATS, CapturedOutput, HintedUsageError, Style
+from recon_cli.commands.console import LOG_FORMATS, Style
+from recon_cli.commands.usage import HintedUsageError, suggest_command
 from recon_cli.config.fields import OptionInfo, StageConfig, field_type, member_types, option_info
 from recon_cli.config.settings import (
     Settings,
@@ -30,6 +29,7 @@ from recon_cli.config.settings import (
 )
 from recon_cli.config.stages import ComputeConfig, PruneConfig, TrainConfig
 from recon_cli.deadline import Deadline
+from recon_cli.errors import use_workspace
 from recon_cli.jobs.executor import CORES
 from recon_cli.workspace.export_formats import READABLE
 from recon_cli.workspace.paths import refuse_special
@@ -87,7 +87,7 @@ class Verb(click.Command):
         if rest and not ctx.resilient_parsing and not isinstance(self, click.Group):
             raise HintedUsageError(
                 f"{ctx.command_path} does not take {' '.join(rest)}.",
-                hint=hints.suggest_command(ctx.command_path, rest), ctx=ctx)
+                hint=suggest_command(ctx.command_path, rest), ctx=ctx)
         return rest
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
@@ -189,13 +189,6 @@ from_import = _switch("--from-import", "Train the imported scene further.")
 print_config = _switch("--print-config", "Print options as TOML and exit.", expert=True)
 
 
-def _begin_object(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
-    if value and not ctx.resilient_parsing:
-        call = ctx.ensure_object(Call)
-        call.as_object, call.output = True, CapturedOutput()
-        ctx.find_root().with_resource(contextlib.redirect_stdout(call.output))
-
-
 def _style_options(*, has_json: bool, expert: bool) -> list[Option]:
     """Returns the options by which every verb is told how to talk; eager, so that errors obey."""
     quiet = Option(
@@ -208,7 +201,7 @@ def _style_options(*, has_json: bool, expert: bool) -> list[Option]:
         help="Log on stderr; auto: bars on a terminal, else lines with the time.  [default: auto]")
     as_object = Option(
         ["--json", "as_object"], is_flag=True, is_eager=True, expose_value=False,
-        callback=_begin_object,
+        callback=_store("as_object"),
         help="Print one JSON object at the end.  [default: off]")
     return [quiet, log_format, *([] if has_json else [as_object])]
 
@@ -240,13 +233,19 @@ def used_variables(command: click.Command) -> list[str]:
             and os.environ.get(option.envvar)]
 
 
+def _use_workspace(ctx: click.Context, _parameter: click.Parameter, value: Path) -> None:
+    ctx.ensure_object(Call).workspace = value
+    use_workspace(ctx.info_name or "", value)
+
+
 def common(*, workspace: str = "workspace", envvar: str | None = "RECON_WORKSPACE") -> Decorator:
     """Returns a decorator that adds -w (default: `envvar`, then `workspace`), --config and -v."""
     return stack([
         click.option(
             "-w", "--workspace", type=PathType(file_okay=False), metavar="DIR",
             default=workspace, envvar=envvar, show_default=True, show_envvar=True,
-            expose_value=False, callback=_store("workspace"), help="Folder of all results."),
+            expose_value=False, is_eager=True, callback=_use_workspace,
+            help="Folder of all results."),
         click.option(
             "--config", "config_file", type=PathType(dir_okay=False),
             expose_value=False, callback=_store("config_file"),

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.flythrough.request import CODECS, FORMATS, OUTPUTS, TOUR, TRAINING, RenderRequest
@@ -102,4 +103,4 @@ def render(
     checked = RenderRequest(path=TOUR if tour else path or TRAINING, views=views, **request)
     from recon_cli.flythrough.run import render_frames
 
-    click.echo(render_frames(checked, open_job(call)))
+    say(render_frames(checked, open_job(call)))

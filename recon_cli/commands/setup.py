@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.options import verb
 
 
@@ -25,4 +26,4 @@ def setup(what: str, file: Path | None) -> None:  # noqa: ARG001  # there is one
 
     path = xfeat_weights.download_weights() if file is None else (
         xfeat_weights.install_weights(file))
-    click.echo(f"The weights of XFeat are kept in {path}.")
+    say(f"The weights of XFeat are kept in {path}.")

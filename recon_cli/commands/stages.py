@@ -9,7 +9,8 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
-from recon_cli.commands.jobs import end_run, name_workspace, open_job_with, run_stages
+from recon_cli.commands.console import say
+from recon_cli.commands.jobs import end_run, open_job_with, run_stages
 from recon_cli.commands.options import Call, explicit_settings, pass_call, verb
 from recon_cli.commands.view import show_training
 from recon_cli.config.export import ExportConfig
@@ -23,6 +24,7 @@ from recon_cli.config.stages import (
     SfmConfig,
     TrainConfig,
 )
+from recon_cli.errors import command_line
 from recon_cli.stages import IMPORT, STAGES
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "room.mp4"
@@ -105,8 +107,7 @@ def import_scene(call: Call, file: Path | None) -> None:
     run_stages(
         call, IMPORT.verb, [IMPORT.name], sources=() if file is None else (file,), table=table)
     if not call.print_config:
-        click.echo(f"next:    {name_workspace('recon view', call.workspace)} or "
-                   f"{name_workspace('recon export --format html', call.workspace)}")
+        say(f"next:    {command_line('view')} or {command_line('export --format html')}")
 
 
 @verb("prune")
@@ -147,7 +148,7 @@ def evaluate(
     if items:
         from recon_cli.commands.compare_scores import compare
 
-        click.echo(compare(
+        say(compare(
             lambda path: open_job_with(dataclasses.replace(call, workspace=path), EvaluateConfig),
             call.workspace, items, form, caption=caption, label=label))
     else:
@@ -155,7 +156,7 @@ def evaluate(
     if explain and not call.print_config:
         from recon_cli.evaluation.metrics import EXPLANATION  # imports torch
 
-        click.echo(EXPLANATION)
+        say(EXPLANATION)
 
 
 @verb("export")

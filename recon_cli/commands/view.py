@@ -13,11 +13,13 @@ from pathlib import Path
 
 import click
 
-from recon_cli.commands import hints, options
+from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
+from recon_cli.commands.usage import suggest_command
 from recon_cli.context import TrainCallback
-from recon_cli.errors import ExitCode, InputError, StageError
+from recon_cli.errors import ExitCode, InputError, StageError, name_command
 from recon_cli.signals import exit_code
 from recon_cli.workspace.layout import Workspace
 
@@ -73,7 +75,7 @@ def view(
         trust = TrustTint(job) if content.views else None
     try:
         with serve_scene(content, photos, host, port, trust) as (_, address):
-            click.echo(f"The scene is at {address} (Ctrl-C ends it)")
+            say(f"The scene is at {address} (Ctrl-C ends it)")
             if _at_a_desktop() if opening is None else opening:
                 webbrowser.open(address)
             wait()
@@ -91,12 +93,12 @@ def show_training(call: Call) -> Iterator[TrainCallback]:
 
     with start_server(HOST, None, label="recon train") as (server, address):
         live = LiveView(server, Workspace(call.workspace))
-        click.echo(f"The training can be watched at {address}")
+        say(f"The training can be watched at {address}")
         try:
             yield live
         finally:
             live.close()
-    click.echo("The page is closed; `recon view` shows the finished scene.", err=True)
+    click.echo(f"The page is closed; {name_command('view')} shows the finished scene.", err=True)
 
 
 def _workspace(call: Call, item: Path | None) -> Path | None:
@@ -105,8 +107,8 @@ def _workspace(call: Call, item: Path | None) -> Path | None:
         if not any(path.is_dir() for path in map(Workspace(call.workspace).folder, _SCENES)):
             raise StageError(
                 f"There is no scene to view in {call.workspace.absolute()}.",
-                hint="Make one by `recon run VIDEO`, name another workspace by `recon view -w "
-                "DIR`, or give a splat file to `recon view`.")
+                hint=f"Make one by {name_command('run VIDEO')}, name another workspace with -w, or "
+                "give a splat file: `recon view FILE`.")
         return call.workspace
     source = click.get_current_context().get_parameter_source("workspace")
     if source == click.core.ParameterSource.COMMANDLINE:
@@ -118,7 +120,7 @@ def _workspace(call: Call, item: Path | None) -> Path | None:
     if not Workspace(item).holds_results:
         raise InputError(
             f"{item} is neither a workspace nor a splat file.",
-            hint=hints.suggest_command("", [str(item)]))
+            hint=suggest_command("", [str(item)]))
     return item
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 import click
 
 from recon_cli.commands import options
+from recon_cli.commands.console import say
 from recon_cli.commands.jobs import open_job
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.commands.sentences import describe_summary
+from recon_cli.errors import name_command
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.clean import CleanItem, find_states, free_space
 from recon_cli.pipeline.plan import Job, StageStatus
@@ -37,19 +39,19 @@ def status(call: Call, as_json: bool) -> None:
     job = open_job(call)
     stages = plan.status(job)
     if as_json:
-        click.echo(json.dumps({
+        say(json.dumps({
             "workspace": str(job.workspace.root),
             "stages": [dataclasses.asdict(stage) for stage in stages]}, indent=1))
         _refuse_damaged(job, stages)
         return
     if not job.workspace.root.exists():
         logger.warning("no workspace at %s yet", job.workspace.root)
-    click.echo(status_table(stages))
+    say(status_table(stages))
     for stage in stages:
         if stage.state == "fresh" and (lines := stage.summary.get("poorly_seen")):
             from recon_cli.workspace.records import name_photos  # imports numpy
 
-            click.echo(name_photos(job.workspace.folder("ingest"))("\n".join(lines)))
+            say(name_photos(job.workspace.folder("ingest"))("\n".join(lines)))
         for notice in stage.notices:
             logger.warning("%s: %s", stage.name, notice)
     _offer("--renders", job.workspace.renders(), job.workspace)
@@ -117,7 +119,7 @@ def clean(
         job, stages, states=states, renders=renders, keep_exports=keep_exports, dry=dry_run,
         show=lambda removals: _list_removals(job, removals))
     outcome = "would be freed" if dry_run else "freed"
-    click.echo(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
+    say(f"{format_megabytes(sum(item.size for item in freed))} {outcome}")
     if not stages and not keep_exports:
         _offer("--states", [] if states else find_states(job), job.workspace)
         _offer("--renders", [] if renders else job.workspace.renders(), job.workspace)
@@ -126,7 +128,7 @@ def clean(
 def _offer(option: str, paths: Sequence[Path], workspace: Workspace) -> None:
     """Says what an option of clean would free."""
     if paths:
-        logger.info("`recon clean %s` frees %s more: %s", option,
+        logger.info("%s frees %s more: %s", name_command(f"clean {option}"),
                     format_megabytes(sum(map(size_of, paths))),
                     ", ".join(str(path.relative_to(workspace.root)) for path in paths))
 
@@ -135,10 +137,10 @@ def _list_removals(job: Job, removals: Sequence[CleanItem]) -> None:
     """Prints what is removed, by stage, with sizes."""
     for stage in dict.fromkeys(item.stage for item in removals):
         own = [item for item in removals if item.stage == stage]
-        click.echo(f"{stage or 'scratch'}: {format_megabytes(sum(item.size for item in own))}")
+        say(f"{stage or 'scratch'}: {format_megabytes(sum(item.size for item in own))}")
         for item in own:
             link = " (a link; its target stays)" * item.is_link
-            click.echo(f"  {item.path.relative_to(job.workspace.root)}: "
+            say(f"  {item.path.relative_to(job.workspace.root)}: "
                        f"{format_megabytes(item.size)}{link}")
 
 
@@ -157,4 +159,4 @@ def report(call: Call, out: Path | None) -> None:
     from recon_cli.report.build import write_report
 
     path = write_report(open_job(call), out)
-    click.echo(f"{path}: {format_megabytes(path.stat().st_size)}")
+    say(f"{path}: {format_megabytes(path.stat().st_size)}")

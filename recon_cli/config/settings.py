@@ -24,7 +24,7 @@ from recon_cli.config.stages import (
     SfmConfig,
     TrainConfig,
 )
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, Hint
 from recon_cli.workspace.atomic import read_text
 
 SECTIONS: dict[str, type[StageConfig]] = {
@@ -51,9 +51,9 @@ GONE: dict[str, dict[str, tuple[Any, ...]]] = {
     "export": {"drop_backdrop": (False,)},
 }
 
-SUCCESSORS = {
+SUCCESSORS: Mapping[tuple[str, str], str | Hint] = {
     ("export", "drop_backdrop"): "Give --backdrop drop, in a file backdrop = 'drop'.",
-    ("prune", "sweep"): "Run `recon prune --again --score NAME --ratio X` for each.",
+    ("prune", "sweep"): Hint("prune", "--again --score NAME --ratio X", then=" for each"),
     ("evaluate", "seeds"): "`recon study --scenes WORKSPACE --seeds N` trains with N seeds.",
     ("train", "far"): "Give --background, in a file background.",
     ("train", "look"): "Give --brightness filmed or even, in a file brightness."}

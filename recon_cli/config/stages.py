@@ -9,7 +9,7 @@ from typing import Any
 
 from recon_cli.config import protocols
 from recon_cli.config.fields import StageConfig, option
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, name_command
 
 SCALE_BETWEEN = (
     "Set the scale: A and B are METRES apart. Each is a frame name (its camera), x,y,z (a point of "
@@ -379,7 +379,8 @@ class PruneConfig(StageConfig):
         if self.max_psnr_drop is not None and self.at == "mid":
             raise ConfigError(
                 "max_psnr_drop compares with a finished model, but pruning at mid has none yet.",
-                hint="`recon train` and then `recon prune`, both without --prune and --at mid.")
+                hint=f"{name_command('train')} and then {name_command('prune')}, both without "
+                "--prune and --at mid.")
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,7 @@ _TRAJ = "lowres_wide.traj"
 _NEAR = 0.0015  # seconds between files of one frame; they are written to the millisecond
 
 
-def is_arkit_scenes(folder: Path) -> bool:
-    """Returns whether a folder is a recording of ARKitScenes, raw or in the 3dod part."""
-    return _home(folder) is not None
-
-
-def _home(folder: Path) -> Path | None:
+def find_arkit_scenes(folder: Path) -> Path | None:
     """Returns the folder that holds the .traj beside pictures."""
     places = [folder, *sorted(folder.glob("*_frames"))] if folder.is_dir() else []
     return next((place for place in places if (place / _TRAJ).is_file()
@@ -50,7 +45,7 @@ def read_arkit_scenes(folder: Path) -> PosedSet:
 
     InputError if there is none; FormatError if the poses are damaged.
     """
-    home = _home(folder)
+    home = find_arkit_scenes(folder)
     assert home is not None
     for kind in _KINDS:
         images = list_timed(home / kind)

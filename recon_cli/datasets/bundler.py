@@ -30,12 +30,8 @@ _LISTS = ("list.txt", "{stem}.list.txt", "{name}.list.txt", "../list.txt")
 _FLIP = np.diag([1.0, -1.0, -1.0])  # from y up and looking along -z
 
 
-def is_bundler(path: Path) -> bool:
-    """Returns whether a folder has a Bundler file with its list, or a file is one."""
-    return _find(path) is not None
-
-
-def _find(path: Path) -> Path | None:
+def find_bundler(path: Path) -> Path | None:
+    """Returns the Bundler file with its list in a folder, or that a file is."""
     files = [path] if path.is_file() else sorted([*path.glob("*.out"), *path.glob("*/bundle.out")])
     return next((file for file in files if file.suffix == ".out"
                  and read_head(file, len(_MARK)) == _MARK and _list_file(file) is not None), None)
@@ -51,7 +47,7 @@ def read_bundler(path: Path) -> PosedSet:
 
     InputError if there is none; FormatError if a file is damaged, or the list of another one.
     """
-    file = _find(path)
+    file = find_bundler(path)
     assert file is not None
     list_file = _list_file(file)
     assert list_file is not None

@@ -19,7 +19,8 @@ from recon_cli.datasets.posed import SUFFIXES, PosedImage, PosedSet, is_file, re
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.colmap_model import Model, NamedImage, count_images, model_suffix, read_model
 from recon_cli.io.images import decode_file
-from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.io.views import spread_inside
+from recon_cli.scene.camera import Lens
 
 logger = logging.getLogger("recon")
 
@@ -57,7 +58,7 @@ def _colors_agree(model: Model, folder: Path, names: list[str]) -> bool:
     step = max(1, len(model.points) // _POINTS)
     points, colors = model.points[::step], model.colors[::step].astype(np.float64)
     right = 0
-    checked = sorted({int((at + 0.5) * len(names) / _CHECKED) for at in range(_CHECKED)})
+    checked = spread_inside(range(len(names)), _CHECKED)
     for index in checked:
         pixels = decode_file(
             folder / names[index], cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -79,19 +80,13 @@ def _difference(
 
     Distortion is left out, so only the middle of the image counts, where it moves little.
     """
-    height, width = rgb.shape[:2]
-    fitted = lens.resized(width, height)
-    focals, _ = MODELS[lens.model]
-    focal = np.array([fitted.params[0], fitted.params[focals - 1]])
-    camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    ahead = camera[:, 2] > 0
-    at = camera[ahead, :2] / camera[ahead, 2:] * focal + fitted.params[focals:focals + 2]
-    x, y = at.T
-    middle = (np.abs(x - width / 2) < width / 4) & (np.abs(y - height / 2) < height / 4)
+    size = np.array(rgb.shape[1::-1])
+    pixels, _ = lens.resized(*size.tolist()).pinhole(viewmat).project(points)
+    middle = (np.abs(pixels - size / 2) < size / 4).all(axis=1)
     if not middle.any():
         return 255.0
-    observed = rgb[y[middle].astype(int), x[middle].astype(int)]
-    return float(np.median(np.abs(observed - colors[ahead][middle]).max(axis=1)))
+    column, row = pixels[middle].astype(int).T
+    return float(np.median(np.abs(rgb[row, column] - colors[middle]).max(axis=1)))
 
 
 # Where a model lies below the folder that was given, and where its images may lie, as paths from

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from recon_cli.datasets.posed import PosedImage
 from recon_cli.errors import FormatError
 from recon_cli.io.calibration import undistort_pixels
-from recon_cli.io.depth_maps import MEDIAN, MOST_NOISE
+from recon_cli.io.depth_maps import LEAST_POINTS, MEDIAN, MOST_NOISE
 from recon_cli.scene.camera import Lens
 
 # Units of a stored value, in metres: what cameras and data sets write.
@@ -36,10 +36,9 @@ _STARTS, _RANKS = 12, 7  # images that are compared, with the 1st, 2nd, 4th to 6
 _LEAST_MOVED, _MOST_MOVED, _MOST_TURNED_DEG = 0.2, 1.0, 40.0
 _GRID = 40  # samples a side of a depth map
 _FEWEST = 100  # samples of a pair that both see
-_LEAST_POINTS = 20  # of a view
 _STEPS, _FINE = 9, np.geomspace(0.8, 1.25, 21)  # of the scales that are tried: 22%, then 2%
 # A scale shows, or is better than another one, if the other's error is this many times its own.
-_SHOWN = 1.5
+CLEARLY_WORSE = 1.5
 # Relative errors, as a median. Depth as it is has 1% in two rendered rooms with 1% of noise, and 3%
 # in a phone's recording of a door; in another order of rows or columns it has 5 to 26%.
 _GOOD, _CLEARLY = 0.03, 1 / 3
@@ -111,9 +110,9 @@ def _name(estimates: Sequence[_Estimate], scale: float, unit: float) -> DepthFit
     own = min(_UNITS, key=lambda one: abs(np.log(scale * unit / one)))
     as_read = _error(estimates, 1.0)
     if _is_near(scale, own / unit) and not _is_near(own / unit, 1.0) and (
-            as_read >= _SHOWN * _error(estimates, own / unit)):
+            as_read >= CLEARLY_WORSE * _error(estimates, own / unit)):
         return DepthFit(own / unit, True, words=f"in {_UNITS[own]}, not in {_describe(unit)}")
-    if _is_near(scale, 1.0) or as_read < _SHOWN * _error(estimates, scale):
+    if _is_near(scale, 1.0) or as_read < CLEARLY_WORSE * _error(estimates, scale):
         return DepthFit(shown=_is_near(scale, 1.0))
     return DepthFit(fault=f"it would fit the poses with values about {scale:.2g} times as large, "
                     "which is no usual unit")
@@ -186,7 +185,7 @@ def _ask_points(
         local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
         there = _look_up(view, local)
         ratios = there[there > 0] / local[there > 0, 2]
-        if len(ratios) >= _LEAST_POINTS:
+        if len(ratios) >= LEAST_POINTS:
             estimates.append(_Estimate(
                 1 / float(np.median(ratios)), partial(_compare_ratios, ratios)))
     return estimates
@@ -260,7 +259,7 @@ def _fit_pair(one: DepthView, other: DepthView, turn: Turn) -> _Estimate | None:
     scale = float(best[at])
     # clearly better than half and twice of it
     beside = compare(scale * np.array([0.5, 2.0]))
-    if not 0 < at < len(best) - 1 or not (beside >= _SHOWN * errors[at]).all():
+    if not 0 < at < len(best) - 1 or not (beside >= CLEARLY_WORSE * errors[at]).all():
         return None
     return _Estimate(scale, compare)
 
@@ -298,13 +297,8 @@ def _look_up(view: DepthView, points: NDArray[np.float64]) -> NDArray[np.float64
 
     Distortion is left out: it moves few pixels to another surface.
     """
-    params = view.lens.params
-    fx, fy, cx, cy = params[:4] if len(params) > 3 else (params[0], *params[:3])
-    height, width = view.depth.shape
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = points[..., 0] / points[..., 2] * fx + cx
-        v = points[..., 1] / points[..., 2] * fy + cy
-        inside = (points[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    depths = np.zeros(inside.shape)
-    depths[inside] = view.depth[v[inside].astype(int), u[inside].astype(int)]
+    camera = view.lens.pinhole(np.eye(4))
+    depths = np.zeros(points.shape[:-1])
+    rows, column, line, _ = camera.find_visible(points.reshape(-1, 3))
+    depths.reshape(-1)[rows] = view.depth[line, column]
     return depths

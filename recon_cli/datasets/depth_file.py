@@ -18,10 +18,10 @@ from recon_cli.datasets import lzfse_stream
 from recon_cli.errors import FormatError
 from recon_cli.io.exr import read_exr
 from recon_cli.scene.camera import MODELS, Lens
+from recon_cli.workspace.records import Confidence
 
 MILLIMETRE = 1e-3
 LIDAR_RANGE = 5.0  # metres; beyond it, phones' depth is a guess
-LOW, MEDIUM, HIGH = 0, 1, 2  # levels of confidence
 _PACKED = (".depth", ".conf")  # Record3D's, without a header
 _MAX_DEPTH = float(np.finfo(np.float32).max)
 _HINT = "Copy the file again, or delete it to go without its depth."
@@ -32,10 +32,10 @@ class ConfidenceFile:
     """Reads how far each value of a depth map can be trusted."""
 
     path: Path
-    high: int = HIGH  # value of the file that means high; medium lies in the middle, low is 0
+    high: int = Confidence.HIGH  # value of the file that means high; medium is half of it
 
     def __call__(self, height: int, width: int) -> NDArray[np.uint8]:
-        """Returns [height, width] of LOW, MEDIUM and HIGH; FormatError if damaged or otherwise."""
+        """Returns [height, width] of `Confidence`; FormatError if damaged or otherwise."""
         stored = _read(self.path, np.dtype(np.uint8), (height, width)).astype(np.float64)
         if stored.shape != (height, width):
             raise FormatError(
@@ -44,7 +44,7 @@ class ConfidenceFile:
         if stored.max(initial=0) > self.high:
             raise FormatError(
                 f"{self.path} holds {stored.max():g}; known are 0 to {self.high}.", hint=_HINT)
-        return np.asarray(np.rint(stored * (HIGH / self.high)), np.uint8)
+        return np.asarray(np.rint(stored * (Confidence.HIGH / self.high)), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class DepthFile:
         depth = self.read()
         depth[depth > self.reliable] = 0
         if self.confidence is not None:
-            depth[self.confidence(*depth.shape) == LOW] = 0
+            depth[self.confidence(*depth.shape) == Confidence.LOW] = 0
         height, width = depth.shape
         own = self.own_lens(width, height)
         if own == self.lens:
@@ -102,7 +102,7 @@ class DepthFile:
         return np.where((values > 0) & (values < _MAX_DEPTH), values, 0).astype(np.float32)
 
     def read_confidence(self) -> NDArray[np.uint8] | None:
-        """Returns [h, w] of LOW, MEDIUM and HIGH, None where the data set has none."""
+        """Returns [h, w] of `Confidence`, None where the data set has none."""
         return None if self.confidence is None else self.confidence(*self.read().shape)
 
     @property
@@ -125,7 +125,7 @@ class DepthFile:
 
 
 def lidar_depth(
-    path: Path | None, level: Path | None, lens: Lens, *, high: int = HIGH
+    path: Path | None, level: Path | None, lens: Lens, *, high: int = Confidence.HIGH
 ) -> DepthFile | None:
     """Returns a phone's depth in millimetres, None without a file; `level` is its confidence."""
     if path is None:

@@ -12,6 +12,7 @@ from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import undistort_pixels
 from recon_cli.io.images import decode_file
+from recon_cli.io.views import spread_inside
 
 MAX_POINTS = 100_000  # as many as INRIA's 3DGS draws if a data set has no points
 # Frames that are read, evenly spread: at two a second 100 s of walking, enough for a room.
@@ -29,8 +30,7 @@ def points_from_depth(
     score. InputError if no image that may be used has depth, FormatError if one cannot be read.
     """
     images = [image for image in posed.images if image.depth is not None and not image.held_out]
-    count = min(len(images), MAX_FRAMES)
-    images = [images[int((at + 0.5) * len(images) / count)] for at in range(count)]
+    images = spread_inside(images, MAX_FRAMES)
     pixels = sum(image.lens.width * image.lens.height for image in images)
     step = max(1, math.ceil(math.sqrt(pixels / (_SAMPLES * max_points))))
     clouds = [_unproject(image, step) for image in images]

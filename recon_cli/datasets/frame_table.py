@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.frame_files import fit_intrinsics, quoted
 from recon_cli.datasets.posed import PosedImage, PosedSet, image_size, is_file
-from recon_cli.errors import FormatError, InputError, format_count
+from recon_cli.errors import FormatError, InputError, command_line, format_count
 from recon_cli.io.calibration import viewmat_from_pose
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace.atomic import read_json
@@ -143,7 +143,7 @@ class FrameTable:
                 f"{self._folder} has no frame with a pose: "
                 f"{'; '.join(notices) or 'it lists none'}.",
                 hint="Put the pictures where the data set says. Or give them alone, so that the "
-                f"cameras are found from them: recon ingest {self._pictures}")
+                f"cameras are found from them: {command_line(f'ingest {self._pictures}')}")
         images, factor = _fit_lenses(there)
         if missing:
             notices.append(f"missing: {len(missing)} of the {len(there) + len(missing)} images "
@@ -194,7 +194,7 @@ def refuse_one_pose(images: Sequence[PosedImage], folder: Path, pictures: str) -
         raise InputError(
             f"All {len(poses)} poses of {folder} are the same: the camera was not tracked, as in "
             "recordings of a front camera.", hint="Give the pictures alone, so that the cameras "
-            f"are found from them: recon ingest {pictures}")
+            f"are found from them: {command_line(f'ingest {pictures}')}")
 
 
 def _fit_lenses(rows: Sequence[PosedImage]) -> tuple[tuple[PosedImage, ...], float]:

@@ -12,14 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.frame_selection import MIN_FRAMES
-from recon_cli.capture.images import (
-    WHITE,
-    describe_white,
-    find_white,
-    is_wide,
-    read_as_stored,
-)
+from recon_cli.capture.images import choose_white, is_wide, read_as_stored
 from recon_cli.capture.ingested_source import IngestContext, IngestedSource
 from recon_cli.capture.masks import opaque, read_mask, write_mask
 from recon_cli.capture.photo_tree import describe_unused
@@ -34,8 +27,9 @@ from recon_cli.datasets.posed import PosedImage, PosedSet, image_size
 from recon_cli.errors import FormatError, InputError, format_count
 from recon_cli.io.depth_maps import write_depth, write_depth_list
 from recon_cli.io.images import fit_image, fit_size, write_png
+from recon_cli.io.views import spread_inside
 from recon_cli.workspace import records as store
-from recon_cli.workspace.records import Frame, Group, KnownPoses
+from recon_cli.workspace.records import MIN_FRAMES, Frame, Group, KnownPoses
 
 # Units between centres up to which all are one: of metres what a float32 rounds, of any other unit
 # nothing that a program would write.
@@ -72,7 +66,8 @@ def _ingest(
         for text in describe_unused(path, used, posed.layout, words):
             ctx.notice(text)
     images = _choose_images(config, posed, ctx)
-    white = _find_white(images, ctx)
+    white = choose_white([image.path for image in images
+                          if image.is_picture and is_wide(image.path)], ctx.notice)
     names = make_frame_names([Path(image.name).stem for image in images])
     broken = _write_images(images, names, config.max_size, white, out, ctx)
     for reason in broken.values():
@@ -115,18 +110,9 @@ def _choose_images(config: IngestConfig, posed: PosedSet, ctx: IngestContext) ->
     most = config.frames or (config.max_frames if posed.sequence else len(rest))
     if len(rest) > most:
         ctx.notice(f"{most} of {len(rest)} frames are used, evenly spread; --frames changes that.")
-        rest = [rest[int((i + 0.5) * len(rest) / most)] for i in range(most)]
+        rest = spread_inside(rest, most)
     chosen = set(rest)
     return [image for image in posed.images if image.held_out or image.name in chosen]
-
-
-def _find_white(images: Sequence[PosedImage], ctx: IngestContext) -> int:
-    """Returns the brightest value of images with 16 bits, and says where it is below 65535."""
-    wide = [image.path for image in images if image.is_picture and is_wide(image.path)]
-    white = find_white(wide) if wide else WHITE
-    if white < WHITE:
-        ctx.notice(describe_white(len(wide), white))
-    return white
 
 
 def _write_images(

@@ -34,18 +34,15 @@ from recon_cli.datasets.posed import (
 )
 from recon_cli.datasets.rgbd import read_matrix, read_pose
 from recon_cli.datasets.trajectory import Trajectory
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.io.calibration import lens_from_matrix
 from recon_cli.scene.camera import Lens, make_lens
 
 _INTRINSICS = "camera-intrinsics.txt"
-_UNKNOWN = 65535.0
 # fx, fy, cx, cy of the Kinect at 640x480: nominal for colours, those of the data set for depth.
 _COLOR_KINECT = (525.0, 525.0, 320.0, 240.0)
 _DEPTH_KINECT = (585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)
-
-_TUM_DEPTH = 1 / 5000
 # fx fy cx cy k1 k2 p1 p2 k3 as the benchmark publishes them for its three cameras; the centre of
 # the first pixel is at 0 there. Sequences of other names get the nominal ones.
 _TUM_CAMERAS = {
@@ -89,7 +86,7 @@ def read_seven_scenes(folder: Path) -> PosedSet:
             viewmat = read_pose(poses.get(number))
             depth = DepthFile(
                 depths[number], MILLIMETRE, lens, depth_lens,
-                unknown=_UNKNOWN) if number in depths else None
+                unknown=np.iinfo(np.uint16).max) if number in depths else None
             table.add(PosedImage(path.name, path, lens, viewmat, depth=depth))
     return replace(table.finish(), metric=True, sequence=True)
 
@@ -111,7 +108,7 @@ def _kinect(
                    for params in (_COLOR_KINECT, _DEPTH_KINECT))
     table.notices.append(
         f"it has no {_INTRINSICS}: a Kinect's usual focal length of {_COLOR_KINECT[0]:.0f} pixels "
-        "is assumed; `recon sfm --poses refine` corrects it")
+        f"is assumed; {name_command('sfm --poses refine')} corrects it")
     return lens, depth
 
 
@@ -140,11 +137,11 @@ def read_tum(folder: Path) -> PosedSet:
             depth = nearest(depths, time, _DEPTH_APART)
             table.add(PosedImage(
                 path.name, path, lens, viewmat,
-                depth=DepthFile(depth, _TUM_DEPTH, lens) if depth and is_file(depth) else None))
+                depth=DepthFile(depth, 1 / 5000, lens) if depth and is_file(depth) else None))
     if not camera:
         table.notices.append(
             f"its name holds neither freiburg1, 2 nor 3: a Kinect's usual focal length of {fx:.0f} "
-            "pixels is assumed; `recon sfm --poses refine` corrects it")
+            f"pixels is assumed; {name_command('sfm --poses refine')} corrects it")
     return replace(table.finish(), metric=True, sequence=True)
 
 

@@ -13,22 +13,22 @@ from pathlib import Path, PurePosixPath
 
 from recon_cli.capture.known_files import refuse_lost_poses
 from recon_cli.capture.masks import mask_folders, match_masks
-from recon_cli.datasets.arkit_scenes import is_arkit_scenes, read_arkit_scenes
-from recon_cli.datasets.bundler import is_bundler, read_bundler
+from recon_cli.datasets.arkit_scenes import find_arkit_scenes, read_arkit_scenes
+from recon_cli.datasets.bundler import find_bundler, read_bundler
 from recon_cli.datasets.colmap import is_colmap, read_colmap
 from recon_cli.datasets.kinect import is_seven_scenes, is_tum, read_seven_scenes, read_tum
 from recon_cli.datasets.llff import is_llff, read_llff
-from recon_cli.datasets.metashape import is_metashape, read_metashape
+from recon_cli.datasets.metashape import find_metashape, read_metashape
 from recon_cli.datasets.nerfcapture import is_nerfcapture, read_nerfcapture
 from recon_cli.datasets.opensfm import is_opensfm, read_opensfm
 from recon_cli.datasets.packed import is_packed
-from recon_cli.datasets.polycam import is_polycam, read_polycam
+from recon_cli.datasets.polycam import find_polycam, read_polycam
 from recon_cli.datasets.posed import PosedSet
 from recon_cli.datasets.quest import is_quest, read_quest
-from recon_cli.datasets.reality_scan import is_reality_scan, read_reality_scan
-from recon_cli.datasets.record3d import is_record3d, read_record3d
+from recon_cli.datasets.reality_scan import find_reality_scan, read_reality_scan
+from recon_cli.datasets.record3d import find_record3d, read_record3d
 from recon_cli.datasets.rgbd import is_replica, is_scannet, read_replica, read_scannet
-from recon_cli.datasets.rtabmap import is_rtabmap, read_rtabmap
+from recon_cli.datasets.rtabmap import find_rtabmap, read_rtabmap
 from recon_cli.datasets.scanner_app import is_scanner_app, read_scanner_app
 from recon_cli.datasets.split_lists import apply_lists
 from recon_cli.datasets.stray_scanner import is_stray, read_stray
@@ -44,7 +44,7 @@ class Layout:
     name: str  # as `PosedSet.layout` has it
     words: str  # its name in a sentence
     needs: str  # its files, for help texts
-    fits: Callable[[Path], bool]  # returns whether a path has the layout
+    fits: Callable[[Path], object]  # returns something true for a path that has the layout
     read: Callable[[Path], PosedSet]  # returns the data set at such a path
     repair: str = "Copy the data set again, or export it again."  # hint where it is damaged
 
@@ -61,17 +61,17 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout("tum", "a TUM RGB-D sequence", "rgb/, rgb.txt and groundtruth.txt, with depth/ or "
            "without", is_tum, read_tum),
     Layout("polycam", "a raw export of Polycam", "keyframes/ with images/, cameras/, depth/ and "
-           "confidence/", is_polycam, read_polycam),
+           "confidence/", find_polycam, read_polycam),
     Layout("record3d", "a recording of Record3D", "rgb/, depth/ and metadata.json; or an .r3d",
-           is_record3d, read_record3d),
+           find_record3d, read_record3d),
     Layout("stray", "a recording of Stray Scanner", "rgb.mp4, odometry.csv and camera_matrix.csv",
            is_stray, read_stray),
     Layout("3dscannerapp", "a scan of 3D Scanner App", "frame_00000.jpg and frame_00000.json",
            is_scanner_app, read_scanner_app),
     Layout("arkitscenes", "a recording of ARKitScenes", "lowres_wide.traj, lowres_wide/ and "
-           "lowres_wide_intrinsics/", is_arkit_scenes, read_arkit_scenes),
+           "lowres_wide_intrinsics/", find_arkit_scenes, read_arkit_scenes),
     Layout("rtabmap", "an export of RTAB-Map", "NAME_rgb/, NAME_calib/ and NAME_camera_poses.txt",
-           is_rtabmap, read_rtabmap,
+           find_rtabmap, read_rtabmap,
            "Export again: rtabmap-export --images --poses_camera --poses_format 11 NAME.db"),
     Layout("quest", "a recording of a Quest headset (MRUK)", "left_camera_mruk_rgba/, "
            "left_camera_mruk_intrinsics.json and left_camera_mruk_frame_metadata.csv", is_quest,
@@ -83,12 +83,12 @@ LAYOUTS: tuple[Layout, ...] = (
            read_transforms),
     Layout("colmap", "a COLMAP model", "images/ and sparse/0/", is_colmap, read_colmap),
     Layout("realityscan", "photos with cameras of RealityScan (RealityCapture, Postshot)",
-           "a .csv with name, x, y, alt, heading, pitch, roll and f", is_reality_scan,
+           "a .csv with name, x, y, alt, heading, pitch, roll and f", find_reality_scan,
            read_reality_scan),
     Layout("metashape", "photos with cameras of Metashape", "an .xml of Export Cameras",
-           is_metashape, read_metashape,
+           find_metashape, read_metashape,
            "Export the cameras again from Metashape: File > Export > Export Cameras, as .xml."),
-    Layout("bundler", "photos with cameras of Bundler", "bundle.out and list.txt", is_bundler,
+    Layout("bundler", "photos with cameras of Bundler", "bundle.out and list.txt", find_bundler,
            read_bundler, "Copy the file again; Bundler's format is that of version 0.3."),
     Layout("opensfm", "photos with cameras of OpenSfM or OpenDroneMap", "reconstruction.json, or "
            "cameras.json and odm_report/shots.geojson", is_opensfm, read_opensfm),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 
 _END = b"bvx$"
-_SHORTEST = 32  # bytes of a packed header
 _WORDS = struct.Struct("<II")
 
 
@@ -44,7 +43,7 @@ def decoded_size(data: bytes) -> int:
                 fields = struct.unpack_from("<QQQ", data, at + 8)
                 literals, matches = fields[0] >> 20 & 0xFFFFF, fields[1] >> 40 & 0xFFFFF
                 header = fields[2] & 0xFFFFFFFF
-                if header < _SHORTEST:  # it would never end
+                if header < 32:  # its fields alone; it would never end
                     raise ValueError("its LZFSE stream is damaged")
                 at += header + literals + matches
             elif kind == b"bvx1":  # LZFSE with a plain header, of 772 bytes

@@ -30,7 +30,6 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.atomic import read_text
 
 _MARKS = re.compile(rb"(?=.*<document)(?=.*<chunk)(?=.*<(?:sensor|camera))", re.DOTALL)
-_HEAD = 1 << 16  # bytes; sensors come before cameras
 _SKEW = 0.5  # pixels that leaving out b2 may move the border
 # On the earth's surface, from its centre: coordinates whose up is not z.
 _ECEF = (6.3e6, 6.4e6)  # metres
@@ -38,15 +37,11 @@ _ECEF = (6.3e6, 6.4e6)  # metres
 _Component = tuple[int, str | None]  # number of the chunk, and id in it
 
 
-def is_metashape(path: Path) -> bool:
-    """Returns whether a folder has such an .xml, or a file is one."""
-    return _find(path) is not None
-
-
-def _find(path: Path) -> Path | None:
+def find_metashape(path: Path) -> Path | None:
+    """Returns the .xml of cameras in a folder, or that a file is."""
     files = [path] if path.is_file() else sorted(path.glob("*.xml"))
     return next((file for file in files if file.suffix.lower() == ".xml"
-                 and _MARKS.match(read_head(file, _HEAD))), None)
+                 and _MARKS.match(read_head(file))), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +57,7 @@ class _Camera:
 
 def read_metashape(path: Path) -> PosedSet:
     """Returns the photos that are aligned; InputError if none is, FormatError if damaged."""
-    file = _find(path)
+    file = find_metashape(path)
     assert file is not None
     folder, cameras, worlds = file.parent, list[_Camera](), dict[_Component, Similarity | None]()
     for at, chunk in enumerate(_read_chunks(file)):

@@ -23,7 +23,8 @@ _UNITS = (1.0, 9.81)  # lengths of gravity
 _OFF_UNIT = 0.15  # share by which the median length may miss them
 _WINDOW = 0.5  # seconds around a frame, over which steps of a walk average out
 _FEWEST = 10  # frames
-_STEADY_DEG = 5.0  # median angle of the directions of single frames to their mean
+# Between the directions of single frames and their mean, in the median; and between two measures.
+UP_AGREES_DEG = 5.0
 _LEAST_TURN_DEG = 30.0  # between frames; with less, any axes would agree
 
 
@@ -38,7 +39,7 @@ class MeasuredUp:
     @property
     def is_sure(self) -> bool:
         """Whether frames that look different ways agree, so that axes and times must be right."""
-        return self.spread_deg <= _STEADY_DEG and self.turn_deg >= _LEAST_TURN_DEG
+        return self.spread_deg <= UP_AGREES_DEG and self.turn_deg >= _LEAST_TURN_DEG
 
 
 def read_gravity(

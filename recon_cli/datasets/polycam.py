@@ -1,6 +1,7 @@
 """Polycam's raw data export: keyframes with images, cameras, LiDAR depth and confidence.
 
-keyframes/{images,cameras,depth,confidence}/<t>.{jpg,json,png,png}, t in microseconds. Cameras hold
+keyframes/{images,cameras,depth,confidence}/<t>.{jpg,json,png,png}, t in microseconds;
+confidence is 0 to 255. Cameras hold
 fx fy cx cy and a 3x4 camera-to-world matrix t_<row><column>, ARKit's camera axes, metres, y up.
 corrected_images with corrected_cameras are undistorted and loop closed, and taken where both are
 there, though a drift of a degree remains; the others keep a distortion that is written nowhere.
@@ -27,15 +28,9 @@ from recon_cli.datasets.posed import PosedImage, PosedSet
 # Pixels along the border of undistorted images that may be black, as nerfstudio crops them of
 # pictures of 1024x768; of smaller ones by share.
 _RIM, _RIM_SHARE = 15, 0.02
-_HIGH = 255  # in the files of confidence
 
 
-def is_polycam(folder: Path) -> bool:
-    """Returns whether a folder is an export of Polycam, or its keyframes."""
-    return _keyframes(folder) is not None
-
-
-def _keyframes(folder: Path) -> Path | None:
+def find_polycam(folder: Path) -> Path | None:
     """Returns the folder of the keyframes."""
     return next((place for place in (folder / "keyframes", folder)
                  if any((place / f"{kind}cameras").is_dir() and (place / f"{kind}images").is_dir()
@@ -44,7 +39,7 @@ def _keyframes(folder: Path) -> Path | None:
 
 def read_polycam(folder: Path) -> PosedSet:
     """Returns the keyframes; InputError if none has an image and a camera."""
-    place = _keyframes(folder)
+    place = find_polycam(folder)
     assert place is not None
     for kind in ("corrected_", ""):
         images = list_numbered(place / f"{kind}images")
@@ -65,7 +60,7 @@ def read_polycam(folder: Path) -> PosedSet:
             rim = min(_RIM, math.ceil(_RIM_SHARE * min(size))) if kind else 0
             table.add(PosedImage(
                 path.name, path, lens, viewmat, time=number / 1e6, rim=rim,
-                depth=lidar_depth(depths.get(number), levels.get(number), lens, high=_HIGH)))
+                depth=lidar_depth(depths.get(number), levels.get(number), lens, high=255)))
     if not kind:
         table.notices.append(
             "it has no corrected cameras (loop closure was off, or the capture too long): the "

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.datasets.depth_agreement import DepthView, compare_views
+from recon_cli.datasets.depth_agreement import CLEARLY_WORSE, DepthView, compare_views
 from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
 from recon_cli.datasets.frame_files import numbers, pose_from_unity, read_csv
 from recon_cli.datasets.frame_table import UNUSABLE, FrameTable, LeftOutError, nearest
@@ -30,8 +30,7 @@ _TURN = tuple(f"create_pose_rotation_{axis}" for axis in "xyzw")
 _COLUMNS = ("timestamp_ms", "width", "height", "near_z", "far_z", *_POSE, *_TURN, *(
     f"fov_{side}_angle_tangent" for side in _TANGENTS))
 _MOST_APART_MS = 50  # from a photo to its depth; a head turns by a degree or two meanwhile
-# As in `depth_agreement`: the best order must agree this well, and the next one clearly worse.
-_GOOD, _CLEARLY = 0.04, 1.5
+_GOOD = 0.04  # relative error in which the best order must agree; the next one clearly worse
 _MOST_SIDE = 4096  # pixels
 
 
@@ -134,7 +133,7 @@ def find_order(frames: Sequence[DepthFrame]) -> Order | None:
             return None
     best = min(errors, key=lambda order: errors[order])
     others = [error for order, error in errors.items() if not _alike(order, best, frames)]
-    if not errors[best] <= _GOOD or min(others, default=np.inf) < _CLEARLY * errors[best]:
+    if not errors[best] <= _GOOD or min(others, default=np.inf) < CLEARLY_WORSE * errors[best]:
         return None
     return best
 

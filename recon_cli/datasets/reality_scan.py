@@ -28,15 +28,10 @@ from recon_cli.scene.camera import Lens
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _HEAD = HEAD_LINES * 4096  # bytes
-_FILM = 36.0  # millimetres, of the longer side
 
 
-def is_reality_scan(path: Path) -> bool:
-    """Returns whether a folder has such a .csv, or a file is one."""
-    return _find(path) is not None
-
-
-def _find(path: Path) -> Path | None:
+def find_reality_scan(path: Path) -> Path | None:
+    """Returns the .csv of cameras in a folder, or that a file is."""
     files = [path] if path.is_file() else sorted(path.glob("*.csv"))
     return next((file for file in files if file.suffix.lower() == ".csv" and any(
         set(column_names(line.split(","))) >= set(_NEEDED) for line in read_head(
@@ -45,7 +40,7 @@ def _find(path: Path) -> Path | None:
 
 def read_reality_scan(path: Path) -> PosedSet:
     """Returns the photos that the .csv lists; InputError if none is there or has a pose."""
-    file = _find(path)
+    file = find_reality_scan(path)
     assert file is not None
     folder = file.parent
     rows = [row for row in read_csv(file, _NEEDED) if row.get("name")]
@@ -82,7 +77,7 @@ def _lens(row: Mapping[str, str], size: tuple[int, int], where: str) -> Lens:
 
     width, height = size
     scale = max(size)
-    focal = number("f") * scale / _FILM
+    focal = number("f") * scale / 36
     inner = (focal, focal, number("px") * scale + width / 2, number("py") * scale + height / 2)
     return radial_lens(size, inner, [number(key) for key in ("k1", "k2", "k3", "k4")],
                        (number("t1"), number("t2")), where)

@@ -26,12 +26,7 @@ from recon_cli.scene.camera import Lens
 from recon_cli.workspace.atomic import read_json
 
 
-def is_record3d(folder: Path) -> bool:
-    """Returns whether a folder is an export of Record3D."""
-    return _find(folder) is not None
-
-
-def _find(folder: Path) -> tuple[Path, Path, str] | None:
+def find_record3d(folder: Path) -> tuple[Path, Path, str] | None:
     """Returns the folder, its metadata and the name of the folder of its images."""
     for place in (folder, folder / "EXR_RGBD"):
         for name, images in (("metadata", "rgbd"), ("metadata.json", "rgb")):
@@ -45,7 +40,7 @@ def read_record3d(folder: Path) -> PosedSet:
 
     InputError if none has a pose; FormatError if the metadata are damaged or lack poses or K.
     """
-    files = _find(folder)
+    files = find_record3d(folder)
     assert files is not None
     place, metadata, name = files
     value = read_json(metadata, dict, finite=False)

@@ -31,18 +31,11 @@ _POSES = re.compile(r"(.+)_camera_poses(?:_(\d+))?\.txt")
 _BASE = re.compile(r"(.+)_poses\.txt")
 _NUMBERS = r"\s*:\s*\[([^\]]*)\]"
 _NEAR = 1e-4  # seconds; stamps are written with 6 decimals
-_PLUMB_BOB = (4, 5)  # k1 k2 p1 p2 (k3)
-_RATIONAL = 8  # and k4 k5 k6
 _SCALES = (2, 100, 255)  # largest values of confidence: ARKit's levels, percent, 8 bits
 _ASKED = 20  # files of confidence that are looked at for the largest value
 
 
-def is_rtabmap(folder: Path) -> bool:
-    """Returns whether a folder is an export of RTAB-Map with poses."""
-    return bool(_find(folder))
-
-
-def _find(folder: Path) -> list[tuple[str, str, Path, bool]]:
+def find_rtabmap(folder: Path) -> list[tuple[str, str, Path, bool]]:
     """Returns name, suffix of the camera, file of poses, and whether these are the base's."""
     cameras = []
     files = sorted(folder.glob("*_poses*.txt")) if folder.is_dir() else []
@@ -68,7 +61,7 @@ def read_rtabmap(folder: Path) -> PosedSet:
 
     InputError if there is none; FormatError if the poses have no time stamps or are damaged.
     """
-    cameras = _find(folder)
+    cameras = find_rtabmap(folder)
     table = FrameTable(folder, pictures=_pictures(folder, cameras[0][0]) or folder)
     unused = sum(_add_camera(table, folder, name, camera, path, base)
                  for name, camera, path, base in (cameras[:1] if cameras[0][3] else cameras))
@@ -209,7 +202,7 @@ def _parse_calibration(text: str, path: Path) -> tuple[Lens, NDArray[np.float64]
     if "equidistant" in text and len(distortion) >= 4:
         return make_lens("OPENCV_FISHEYE", width, height, (*inner, *_fisheye(distortion)),
                          str(path)), transform
-    if len(distortion) not in (*_PLUMB_BOB, _RATIONAL):
+    if len(distortion) not in (4, 5, 8):  # k1 k2 p1 p2 (k3), and k4 k5 k6
         raise FormatError(f"{path} has {len(distortion)} coefficients of distortion.")
     padded = (*distortion, *[0.0] * (8 - len(distortion)))
     return make_lens("FULL_OPENCV", width, height, (*inner, *padded), str(path)), transform

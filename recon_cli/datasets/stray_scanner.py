@@ -27,14 +27,13 @@ from recon_cli.datasets.frame_files import (
     read_csv,
 )
 from recon_cli.datasets.frame_table import Y_UP, FrameTable, LeftOutError
-from recon_cli.datasets.phone_gravity import read_gravity
+from recon_cli.datasets.phone_gravity import UP_AGREES_DEG, read_gravity
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
 
 _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _IMU = "imu.csv"
-_MOST_TILTED_DEG = 5.0  # by which ARKit's y may miss up; it is good to about one
 _SPARE_ROWS, _SPARE_SHARE = 3, 0.02  # by which rows and frames of a whole recording differ
 _INNER = ("fx", "fy", "cx", "cy")
 
@@ -91,7 +90,7 @@ def _check_up(posed: PosedSet, imu: Path) -> PosedSet:
     if gravity is None or not gravity.is_sure:
         return posed
     off = float(np.degrees(np.arccos(np.clip(gravity.up @ np.array(Y_UP), -1, 1))))
-    if off <= _MOST_TILTED_DEG:
+    if off <= UP_AGREES_DEG:  # ARKit's y is good to about one degree
         return posed
     x, y, z = gravity.up
     return replace(posed, up=(float(x), float(y), float(z)), notices=(*posed.notices, (

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from recon_cli.datasets.depth_file import LIDAR_RANGE, DepthFile
+from recon_cli.datasets.depth_file import LIDAR_RANGE, MILLIMETRE, DepthFile
 from recon_cli.datasets.exported_files import read_cloud
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.datasets.frame_files import find_number
@@ -32,7 +32,7 @@ from recon_cli.datasets.posed import (
     resolve_inside,
 )
 from recon_cli.datasets.split_lists import PARTS, match_parts, split_parts
-from recon_cli.errors import FormatError, InputError, format_count
+from recon_cli.errors import FormatError, Hint, InputError, format_count
 from recon_cli.io.calibration import pose_from_viewmat, viewmat_from_pose
 from recon_cli.scene.camera import Camera, Lens, make_lens
 from recon_cli.workspace.atomic import read_json, write_json
@@ -43,7 +43,6 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # COLMAP's order in FULL_OPENCV
 _LARGEST = sys.float_info.max
 _FILE = "transforms.json"
-_DEPTH_UNIT = 1e-3  # nerfstudio's default: depth in millimetres
 _HINT = "Export it again from the program that it came from."
 
 
@@ -362,7 +361,7 @@ def _unit(frame: _Frame) -> float:
         raise FormatError(
             f"{frame.where} has depth_unit_scale_factor = {unit:g}; needed is one above 0.",
             hint=_HINT)
-    return _DEPTH_UNIT if unit is None else unit
+    return MILLIMETRE if unit is None else unit  # nerfstudio's default
 
 
 def _add_points(posed: PosedSet, file: Path) -> PosedSet:
@@ -399,7 +398,7 @@ def write_transforms(
     view.
     """
     if not views:
-        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+        raise InputError("There are no cameras to write.", hint=Hint("sfm", then=" first"))
     names = [name for name, _ in views]
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:

@@ -12,7 +12,7 @@ from typing import Any
 
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.context import StageContext
-from recon_cli.errors import FormatError, ManifestError
+from recon_cli.errors import FormatError, Hint, ManifestError
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import CONVENTION_LINES, CONVENTIONS, MASK_CONVENTION
 from recon_cli.evaluation.reference_views import reference_digest, score_views
@@ -57,7 +57,7 @@ def read_workspace_scores(name: str, folder: Path) -> list[ScoredModel]:
     except ManifestError as error:
         raise FormatError(
             f"{folder / Metrics.FILE} does not hold scores: {error.message}.",
-            hint="Run `recon eval --again` in that workspace.") from error
+            hint=Hint("eval", again=True, then=" in that workspace")) from error
     return [
         ScoredModel(name, model, f"{name}, {metrics.label(model)}", score, metrics.truth_digest,
                     metrics.label(model))
@@ -89,7 +89,7 @@ def _undo_export(splats: Splats, record: Path) -> Splats:
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
             f"{record} does not hold the frame of an export: {error!r}.",
-            hint="Run `recon export --again`, or score a copy of the file in another folder.",
+            hint=Hint("export", again=True, then=", or score a copy of the file in another folder"),
         ) from error
     if similarity.is_identity:
         return splats

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError, ReconstructionError
+from recon_cli.errors import ConfigError, Hint, ReconstructionError
 from recon_cli.evaluation.metrics import Perceptual, both_ssim, corrected_psnr, psnr, ssim
 from recon_cli.evaluation.panoramas import FaceScore, face_weights, join_faces, score_face
 from recon_cli.evaluation.scores import MeanScore, ViewScore
@@ -112,7 +112,7 @@ def load_held_out_views(scene: Scene, max_size: int, ctx: StageContext) -> list[
     if not scene.test:
         raise ReconstructionError(
             f"No held-out view has a camera ({len(scene.unregistered_test)} were held out).",
-            hint="Run `recon ingest` with another --holdout, such as every:8.")
+            hint=Hint("ingest", then=" with another --holdout, such as every:8"))
     views = load_reference_views(scene.test, max_size, ctx, threads=ctx.threads)
     if not views:
         raise ReconstructionError(

@@ -12,6 +12,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from recon_cli.config.stages import MODEL_LABELS
+from recon_cli.errors import Hint
 from recon_cli.evaluation.intervals import Interval
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.summaries import JsonRecord
@@ -163,7 +164,7 @@ class Metrics(JsonRecord):
     def read(cls, evaluate: Path) -> Self:
         """Returns a folder's scores; ManifestError for another version, FormatError if damaged."""
         return cls.from_json(read_json(
-            evaluate / cls.FILE, dict, hint="Run `recon eval --again`."))
+            evaluate / cls.FILE, dict, hint=Hint("eval", again=True)))
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,6 @@ line of runs.jsonl, flushed before the next run starts.
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -40,11 +38,10 @@ from recon_cli.train.fit.task import Task
 from recon_cli.train.parts.table import model_parts
 from recon_cli.train.plan import first_count
 from recon_cli.train.prune.prune_loop import RATIO, PruneRun, prune_loop, remaining, rounds_within
-from recon_cli.workspace.atomic import parse_json, write_bytes
 from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.steps import StepFolder
 
 RECORDS_FILE = "runs.jsonl"
-_VERSION = 1  # of its lines
 STEPS = 3000  # of a run: about half a minute on two cores, and enough to tell recipes apart
 PILOT_STEPS = 200  # the number of Gaussians changes twice in them at the usual interval of 100
 _WARM_STEPS = 10  # for caches and threads; the kernels are compiled before
@@ -185,50 +182,23 @@ def key_of(loaded: ExperimentScene, run: TrainingRun) -> str:
         "device": loaded.ctx.device})
 
 
-class Records:
-    """The records in a folder, by key; FormatError where its file holds something else."""
+def open_records(folder: Path) -> StepFolder:
+    """Returns the finished runs in a folder, by key.
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / RECORDS_FILE
-        text = self._path.read_text(encoding="utf-8") if self._path.exists() else ""
-        lines = [line for line in text.splitlines(True) if line.endswith("\n")]
-        if text != "".join(lines):
-            write_bytes(self._path, "".join(lines).encode())
-        self._values: dict[str, Mapping[str, Any]] = {}
-        for number, line in enumerate(lines, start=1):
-            try:
-                entry = parse_json(line, dict)
-                if entry["version"] == _VERSION:
-                    self._values[entry["key"]] = entry["value"]
-            except (ValueError, KeyError, TypeError) as error:
-                raise FormatError(
-                    f"{self._path}, line {number}, is not a record of a run.",
-                    hint="Remove that line; its run is then repeated.") from error
-
-    def run(self, key: str) -> Record | None:
-        """Returns a finished run, None where there is none."""
-        value = self.find(key)
-        return None if value is None else Record(
-            (CurvePoint(**value["point"]),), value["machine"], value["parts"])
-
-    def find(self, key: str) -> Mapping[str, Any] | None:
-        """Returns the value that was added under a key, if any."""
-        return self._values.get(key)
-
-    def add_run(self, key: str, record: Record, run: TrainingRun, scene: str) -> None:
-        """Appends a finished run, with scene, variant and seed for readers of the file."""
-        self.add(key, {
-            "point": asdict(record.last), "machine": record.machine, "parts": record.parts,
-            "scene": scene, "arm": run.variant.name, "seed": run.seed})
-
-    def add(self, key: str, value: Mapping[str, Any]) -> None:
-        """Appends a value, and returns when it is on the disk."""
-        line = json.dumps({"version": _VERSION, "key": key, "value": value}) + "\n"
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(line)
-            file.flush()
-            os.fsync(file.fileno())
-        self._values[key] = value
+    FormatError where its file holds something else, or runs of another version of recon.
+    """
+    path = folder / RECORDS_FILE
+    records = StepFolder(folder, path)
+    try:
+        if path.exists():
+            records.refuse_damaged_log()
+            records.find_damage()  # cuts off a line that was being written
+    except ValueError as error:
+        raise FormatError(
+            f"{error}, or of another version of recon.",
+            hint=f"Remove that line, or move {path} elsewhere; its runs are then repeated.",
+        ) from error
+    return records
 
 
 @dataclass(frozen=True)
@@ -255,7 +225,7 @@ class Runner:
 
     def __init__(
         self, base: RunConfig, progress: Progress, machine: str = "",
-        records: Records | None = None,
+        records: StepFolder | None = None,
     ) -> None:
         self._base, self._progress = base, progress
         self._machine, self._records = machine, records
@@ -300,7 +270,9 @@ class Runner:
 
     def find_record(self, loaded: ExperimentScene, run: TrainingRun) -> Record | None:
         """Returns an earlier run, None where there is none or nothing is recorded."""
-        return self._records.run(key_of(loaded, run)) if self._records else None
+        value = self._records.result(key_of(loaded, run)) if self._records else None
+        return None if value is None else Record(
+            (CurvePoint(**value["point"]),), value["machine"], value["parts"])
 
     def make(
         self, loaded: ExperimentScene, run: TrainingRun, score_at: Sequence[int],
@@ -313,7 +285,9 @@ class Runner:
                  *(name for name, value in model_parts(config).items() if value == "on")]
         record = Record(points, self._machine, ", ".join(parts))
         if self._records:
-            self._records.add_run(key_of(loaded, run), record, run, loaded.folders.name)
+            self._records.finish(key_of(loaded, run), {
+                "point": asdict(record.last), "machine": record.machine, "parts": record.parts,
+                "scene": loaded.folders.name, "arm": run.variant.name, "seed": run.seed})
         return record
 
 

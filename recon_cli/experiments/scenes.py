@@ -14,7 +14,7 @@ from recon_cli.config.settings import Settings, build, merge
 from recon_cli.config.stages import ComputeConfig, IngestConfig, RunConfig, SfmConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.datasets.layouts import recognise, refuse_incomplete
-from recon_cli.errors import ConfigError, InputError, ReconstructionError
+from recon_cli.errors import ConfigError, Hint, InputError, ReconstructionError
 from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.variants import TrainingRun
 from recon_cli.io.training_scene import held_out_names, load_scene
@@ -84,8 +84,8 @@ def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
         if recognise(path) is None:
             raise InputError(
                 f"{path} is neither a workspace with cameras nor a data set with poses.",
-                hint=f"Run `recon ingest {path} -w WORKSPACE` and `recon sfm -w WORKSPACE`, and "
-                     "give that workspace.")
+                hint=f"Find its cameras in a workspace, by `recon ingest {path}` and then sfm, "
+                     "and give that workspace.")
     return scenes
 
 
@@ -160,7 +160,7 @@ def load_for_training(
     if split == "test" and not scene.test:
         raise ReconstructionError(
             f"No held-out view of {folders.name} has a camera.",
-            hint="Run `recon ingest` with a --holdout such as every:8.")
+            hint=Hint("ingest", then=" with a --holdout such as every:8"))
     if split == "validation" and not scene.validation:
         raise ConfigError(
             f"{folders.name} has no validation views.",

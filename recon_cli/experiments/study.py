@@ -32,11 +32,11 @@ from recon_cli.experiments.runner import (
     FIGURES,
     ExperimentRequest,
     Record,
-    Records,
     Runner,
     Runs,
     SceneRuns,
     key_of,
+    open_records,
     shared_options,
 )
 from recon_cli.experiments.scenes import ExperimentScene, check_scenes
@@ -52,6 +52,7 @@ from recon_cli.progress import Progress
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import sha256_json
 from recon_cli.workspace.layout import disk_errors, hold_lock
+from recon_cli.workspace.steps import StepFolder
 
 # The paper compares the first two; the others are `recon train` without and with --prune.
 VARIANTS: tuple[Variant, ...] = (REFERENCE, PAPER, BUDGET, BUDGET_PRUNED)
@@ -186,7 +187,7 @@ def run(request: StudyRequest, progress: Progress) -> Result:
             hint="Give another folder with --out.") from error
     with (disk_errors(out, "running study"),
           hold_lock(out, "study", other="another folder with --out")):
-        records = Records(out)
+        records = open_records(out)
         host, loading = request.load(paths, out / "scenes", "test", progress)
         machine = f"{host.cpu}, {host.device}, {host.threads} threads"
         study = Study(request, records, progress, machine)
@@ -226,7 +227,7 @@ class Study:
     """The runs of a study: recorded ones, and those still to be made."""
 
     def __init__(
-        self, request: StudyRequest, records: Records, progress: Progress, machine: str
+        self, request: StudyRequest, records: StepFolder, progress: Progress, machine: str
     ) -> None:
         self._request, self._records, self._progress = request, records, progress
         self._runner = Runner(request.base, progress, machine, records)
@@ -275,7 +276,7 @@ class Study:
         """Returns how many runs of a variant are missing; those of unknown steps are, too."""
         steps: list[Mapping[str, int] | None] = [{variant.name: self._request.iterations}]
         if EQUAL_SECONDS in self._request.design.comparisons:
-            fixed = self._records.find(self._steps_key(loaded))
+            fixed = self._records.result(self._steps_key(loaded))
             steps.append(fixed and fixed["steps"])
         return sum(
             by_variant is None or self._runner.find_record(loaded, TrainingRun(
@@ -301,7 +302,7 @@ class Study:
     def _steps(self, loaded: ExperimentScene, equal: Runs) -> Mapping[str, int]:
         """Returns the steps at equal seconds: fixed ones, or a guess corrected by one run each."""
         key, count = self._steps_key(loaded), self._request.iterations
-        if (fixed := self._records.find(key)) is not None:
+        if (fixed := self._records.result(key)) is not None:
             return dict(fixed["steps"])
         seconds = {name: statistics.median(self._seconds(record) for record in records)
                    for name, records in equal.items()}
@@ -314,7 +315,7 @@ class Study:
                     loaded, guess, (), bar.advance)
                 steps[name] = correct_steps(
                     count, steps[name], seconds[name], self._seconds(record), max(seconds.values()))
-        self._records.add(key, {"steps": steps})
+        self._records.finish(key, {"steps": steps})
         return steps
 
     def _seconds(self, record: Record) -> float:

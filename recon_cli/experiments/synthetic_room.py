@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.splats import Splats
 
 _ROOM = np.array([6.0, 4.0, 3.0])  # metres; z is up
@@ -76,11 +76,7 @@ def room(n: int, width: int, height: int, *, seed: int = 0) -> tuple[Splats, Cam
     splats = Splats.from_parameters(
         {k: torch.tensor(v, dtype=torch.float32) for k, v in values.items()})
     # at eye height, looking into the far corner, slightly down
-    forward = np.array([3.5, 2.0, -0.4]) / np.linalg.norm([3.5, 2.0, -0.4])
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = [right, np.cross(forward, right), forward]
-    viewmat[:3, 3] = -viewmat[:3, :3] @ [1.0, 1.0, 1.6]
+    eye = np.array([1.0, 1.0, 1.6])
+    viewmat = looking_at(eye, eye + np.array([3.5, 2.0, -0.4]), np.array([0, 0, 1.0]))
     focal = 0.85 * width
     return splats, Camera(width, height, focal, focal, width / 2, height / 2, viewmat)

@@ -39,7 +39,7 @@ _TRIES = 4  # each leaves out a quarter of the one before
 # has its middle 3 of its standard deviations (2.4 degrees) farther aside, is nearer by 1 / 1.15.
 _BEHIND = 1.15
 _STEPS = 40  # of bisections: more than the digits of float32
-_FAR = 10.0  # times the size of the bulk: the room is a dot in a viewer that shows all
+WIDE = 10.0  # times the size of the bulk: the room is a dot in a viewer that shows all
 _BULK = (0.05, 0.95)  # quantiles along each axis, between which the bulk lies
 
 
@@ -208,14 +208,14 @@ def describe_bounds(splats: Splats) -> str:
     low, high = find_bulk(means)
     bulk, alone = float((high - low).max()), _reach(means)
     across = _reach(splats.with_sphere().means.double().cpu())
-    if not across > _FAR * bulk or not bulk:
+    if not across > WIDE * bulk or not bulk:
         return ""
     text = (f"the files reach {across:,.4g} units across, but nine tenths of the Gaussians lie "
             f"between {_corner(low)} and {_corner(high)}, so viewers that fit the bounds start far "
             "away.")
     if splats.backdrop is not None:
         text += f" --backdrop drop leaves out the sphere behind them ({alone:,.4g} units are left)."
-    if alone > _FAR * bulk:
+    if alone > WIDE * bulk:
         text += " --crop cuts off everything outside a box."
     return text
 

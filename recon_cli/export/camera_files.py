@@ -15,16 +15,23 @@ from numpy.typing import NDArray
 
 from recon_cli.datasets.transforms import DepthPaths, write_transforms
 from recon_cli.export.source import ExportSource
-from recon_cli.io.colmap import project, write_colmap, write_priors
-from recon_cli.io.depth_maps import DepthMap, read_depth, read_depth_list
+from recon_cli.io.colmap import write_colmap, write_priors
+from recon_cli.io.depth_maps import (
+    DepthMap,
+    find_visible,
+    lens_camera,
+    read_depth,
+    read_depth_list,
+)
 from recon_cli.io.images import write_png
 from recon_cli.io.meshes import write_point_cloud
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.faces import pixel_rays
 from recon_cli.workspace.export_formats import ExportFormat
 
 _IMAGES, _DEPTH, _DATABASE = "images", "depth", "database.db"
 _SPARSE = "sparse_pc.ply"  # as nerfstudio calls it
-_MOST = 65535  # value of 16 bits
+_MOST = int(np.iinfo(np.uint16).max)  # value of 16 bits
 _UNIT = 1e-3  # of the scene, of a value of 1: millimetres, nerfstudio's default
 # Standard deviation of a camera's place in a room, in metres: what bundle adjustment leaves.
 _DEVIATION = 0.01
@@ -96,12 +103,7 @@ def _as_seen(ingest: Path, name: str, one: DepthMap, camera: Camera) -> NDArray[
         depth[levels == 0] = 0
     if one.reliable is not None:
         depth[depth > one.reliable] = 0
-    x, y = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
-                       (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy)
-    at = project(one.lens, np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1))
-    inside = np.isfinite(at).all(axis=1) & (at >= 0).all(axis=1) & (
-        at < (one.lens.width, one.lens.height)).all(axis=1)
-    seen = np.zeros(x.size)
-    columns, rows = at[inside].astype(int).T
-    seen[inside] = depth[rows, columns]
-    return seen.reshape(x.shape)
+    seen = np.zeros(camera.height * camera.width)
+    rows, column, line = find_visible(lens_camera(one.lens), pixel_rays(camera).reshape(-1, 3))
+    seen[rows] = depth[line, column]
+    return seen.reshape(camera.height, camera.width)

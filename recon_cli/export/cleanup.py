@@ -30,27 +30,28 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, name_command
 from recon_cli.render import RenderOutput, render
+from recon_cli.render.contract import ALPHA_MIN
+from recon_cli.render.depth_loss import LEAST_COVERAGE
+from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.splats.values import measure_distances, measure_extent
 
 _TOUCH = 3.0  # standard deviations
 _NEIGHBOURS = 16  # compared with each; a surface around a Gaussian has about six
 _SMALL = 0.005  # of the Gaussians at most
 _APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
-_BULK = 0.9  # of the scene lies within its radius
 _EDGE = 0.005  # of the scene lies beyond each side of its box
-_VISIBLE = 1 / 255  # fainter ones are not rendered, and touch nothing
 # Measurements behind these constants: tests/bench/notes/scenes.md.
 _WEIGHT = 0.01  # alpha T; below, a view does not show it. RadSplat's threshold for high quality
 _FEW = 2  # views
 _IN_FRONT = 0.5  # of the depth of the surface behind
-_SOLID = 0.5  # coverage from which something counts as behind
 _HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
 _FAINT = 0.1  # opacity; without views only such a large Gaussian counts as haze
-_HAZE = 0.1  # of the distance from the middle, at least of the radius
+HUGE = 0.1  # of the distance from the middle, at least of the radius
 _WORST = 0.2  # of the greatest harm: the threshold of a round
 _ROUNDS = 12
 
@@ -96,10 +97,9 @@ def drop_floaters_without_views(splats: Splats, room: tuple[list[float], float])
     [3] and radius. ConfigError if nothing would be left.
     """
     means, opacities = splats.means.detach().double(), splats.opacities.detach()
-    invisible = opacities < _VISIBLE
-    away = (means - means.median(dim=0).values).norm(dim=1)
-    bulk = away.sort().values[round(_BULK * (len(away) - 1))]
-    large = splats.scales.detach().amax(dim=1) > _HAZE * away.clamp_min(bulk)
+    invisible = opacities < ALPHA_MIN
+    away, bulk = measure_distances(means)
+    large = splats.scales.detach().amax(dim=1) > HUGE * away.clamp_min(bulk)
     haze = (opacities < _FAINT) & large & ~invisible
     alone = torch.zeros_like(invisible)
     rows = torch.nonzero(splats.within(*room) & ~invisible)[:, 0]
@@ -118,7 +118,7 @@ def _drop(splats: Splats, removed: Tensor, option: str) -> Splats:
     if not torch.any(remaining):
         raise ConfigError(
             f"{option} would remove all {len(splats):,} Gaussians.",
-            hint="Check that the views show the scene: `recon render --views train`.")
+            hint=f"Check that the views show the scene: {name_command('render --views train')}.")
     return splats.select(remaining)
 
 
@@ -238,13 +238,11 @@ def _find_in_front(
 
 def _is_before(means: Tensor, camera: Camera, behind: RenderOutput) -> Tensor:
     """Returns which centres [K, 3] are far in front of a rendered surface, [K] bool."""
-    viewmat = torch.from_numpy(camera.viewmat).to(means)
-    x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(dim=1)
-    ahead = z.clamp_min(1e-6)
-    column = (camera.fx * x / ahead + camera.cx).long().clamp(0, camera.width - 1)
-    line = (camera.fy * y / ahead + camera.cy).long().clamp(0, camera.height - 1)
+    pixels, z = TensorCamera.from_camera(camera, means).project(means)
+    column, line = pixels.long().unbind(1)
+    column, line = column.clamp(0, camera.width - 1), line.clamp(0, camera.height - 1)
     cover = behind.alpha[line, column]
-    return (cover >= _SOLID) & (z * cover < _IN_FRONT * behind.depth[line, column])
+    return (cover >= LEAST_COVERAGE) & (z * cover < _IN_FRONT * behind.depth[line, column])
 
 
 def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor:
@@ -254,7 +252,7 @@ def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor
     None if unknown. Groups outside the box of the scene that a view shows, through a window, are
     not islands.
     """
-    drawn = (near & (splats.opacities >= _VISIBLE)).cpu()
+    drawn = (near & (splats.opacities >= ALPHA_MIN)).cpu()
     rows = torch.nonzero(drawn)[:, 0]
     is_island = torch.zeros(len(splats), dtype=torch.bool)
     if len(rows) <= _NEIGHBOURS:
@@ -309,8 +307,7 @@ def _find_far_groups(
 ) -> NDArray[np.bool_]:
     """Returns for each group whether it lies completely apart from the main one."""
     scene = means[group == main]
-    middle = np.median(scene, axis=0)
-    radius = np.quantile(np.linalg.norm(scene - middle, axis=1), _BULK)
+    _, radius = measure_extent(scene)
     nearest = np.full(int(group.max()) + 1, np.inf)
     distance, _ = cKDTree(scene).query(means)
     np.minimum.at(nearest, group, distance)

@@ -20,7 +20,7 @@ from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
 from recon_cli.export.cleanup import drop_floaters_without_views, drop_islands
 from recon_cli.export.reduce import Box, LowerDegrees, crop, fit_to_size, measure_change
-from recon_cli.export.synthetic_cameras import ASSUMED_DB, SelfPsnr, synthetic_scene
+from recon_cli.export.synthetic_cameras import ASSUMED_DB, VIEW_SIZE, SelfPsnr, synthetic_scene
 from recon_cli.export.verify import file_size, measure_size, verify_ply, write_until_good
 from recon_cli.scene.gravity import turn_onto
 from recon_cli.scene.scene import Scene
@@ -35,7 +35,6 @@ from recon_cli.workspace import durable
 from recon_cli.workspace.atomic import sync_folder
 from recon_cli.workspace.export_formats import ExportFormat, LossLimit
 
-_VIEW_SIZE = 600  # pixels, longest side of the renders that a file is checked on
 _GUESSED_UP = "-y"  # of a file that does not say, as in viewers
 _NO_VIEWS = (
     "--drop-floaters has no views here: it finds Gaussians that are too faint to be drawn, faint "
@@ -229,7 +228,7 @@ class _Reducer:
     @cached_property
     def _scene(self) -> Scene:
         up = np.array(UP[nearest_up(self._up)])
-        return synthetic_scene(self._splats, up=up, max_size=_VIEW_SIZE)
+        return synthetic_scene(self._splats, up=up, max_size=VIEW_SIZE)
 
     @property
     def _room(self) -> tuple[list[float], float]:

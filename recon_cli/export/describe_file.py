@@ -16,23 +16,20 @@ from torch import Tensor
 
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
-from recon_cli.export.bounds import find_bulk
-from recon_cli.export.synthetic_cameras import synthetic_scene
+from recon_cli.export.bounds import WIDE, find_bulk
+from recon_cli.export.cleanup import HUGE
+from recon_cli.export.synthetic_cameras import VIEW_SIZE, VISIBLE, synthetic_scene
 from recon_cli.render import render
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import UP
 from recon_cli.splats.foreign import FLAT
 from recon_cli.splats.format import LoadedScene
 from recon_cli.splats.registry import format_of, load_splats
+from recon_cli.splats.values import measure_distances
 
-_VIEW_SIZE = 600  # pixels, longest side of the renders that overdraw is counted in
-_VISIBLE = 0.5 / 255  # coverage that changes an 8-bit image
 _TINY = 5e-4  # of the radius: half a pixel in an image 1000 pixels wide, taken from that far
-_HUGE = 0.1  # of the radius, or of the distance from the middle
 _FAINT = 0.05  # opacity of nearly transparent ones
-_BULK = 0.9  # of the Gaussians lie within the radius
 _FAR = 100.0  # radii from the origin
-_WIDE = 10.0  # times the bulk: viewers that fit all start far away
 _MANY = 0.5  # share that is worth a word
 
 logger = logging.getLogger("recon")
@@ -91,8 +88,8 @@ def describe_file(path: Path, ctx: StageContext) -> FileFindings:
     if not len(splats):
         raise FormatError(f"{path} holds no Gaussians.", hint="Export it again.")
     means = splats.means.double()
-    away = (means - means.median(dim=0).values).norm(dim=1)
-    radius = float(away.sort().values[round(_BULK * (len(away) - 1))])
+    away, bulk = measure_distances(means)
+    radius = float(bulk)
     size = splats.scales.amax(dim=1)
     low, high = find_bulk(means)
     overdraw = _measure_overdraw(splats, np.array(UP[scene.up or "-y"]), ctx)
@@ -107,7 +104,7 @@ def describe_file(path: Path, ctx: StageContext) -> FileFindings:
         bounds=_corners(means.amin(dim=0) + shift, means.amax(dim=0) + shift),
         bulk_bounds=_corners(low + shift, high + shift),
         median_size=float(size.median()), tiny=_share(size < _TINY * radius),
-        huge=_share(size > _HUGE * away.clamp_min(radius)),
+        huge=_share(size > HUGE * away.clamp_min(radius)),
         nearly_transparent=_share(splats.opacities < _FAINT), overdraw=overdraw,
         problems=tuple(_printable(text) for text in problems))
 
@@ -151,7 +148,7 @@ def _find_problems(
         found.append(f"everything is far away: {middle:.4g} units from the origin, where the scene "
                      f"has a radius of {radius:.4g}; viewers that turn about the origin miss it")
     across = float((means.amax(dim=0) - means.amin(dim=0)).max())
-    if across > _WIDE * float((bulk[1] - bulk[0]).max()) > 0:
+    if across > WIDE * float((bulk[1] - bulk[0]).max()) > 0:
         found.append(f"it is {across:.4g} units across, but nine tenths of the Gaussians lie in a "
                      "small part of that: viewers that fit all start far away")
     if _share(splats.opacities < _FAINT) > _MANY:
@@ -167,12 +164,12 @@ def _measure_overdraw(
     """Returns how many Gaussians contribute to a covered pixel of synthetic views, on the mean."""
     on_device = splats.map(lambda tensor: tensor.to(ctx.device))
     hits = pixels = 0
-    for view in synthetic_scene(splats, up=up, max_size=_VIEW_SIZE).train:
+    for view in synthetic_scene(splats, up=up, max_size=VIEW_SIZE).train:
         with torch.no_grad():
             output = render(on_device, view.camera, on_device.background, 0, backend=ctx.backend,
                             scores=True)
         hits += int(output.statistics.hits.sum())
-        pixels += int((output.alpha > _VISIBLE).sum())
+        pixels += int((output.alpha > VISIBLE).sum())
     return hits / pixels if pixels else None
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from recon_cli.context import StageContext
-from recon_cli.errors import FormatError, ReconstructionError
+from recon_cli.errors import FormatError, Hint, ReconstructionError, name_command
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr
 from recon_cli.io.views import ReferenceView, evenly_spread
@@ -70,7 +70,7 @@ def read_world(place: Path) -> Similarity:
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
             f"{place / WorldSummary.FILE} holds no similarity: {error}.",
-            hint="Run `recon sfm --again`.") from error
+            hint=Hint("sfm", again=True)) from error
 
 
 def align_to_views(
@@ -93,7 +93,8 @@ def align_to_views(
         raise ReconstructionError(
             "There is no training view to compare the imported scene with: none has a camera, or "
             "masks leave nothing of them.",
-            hint="Run `recon ingest` with other images or masks, then `recon sfm`.")
+            hint=f"Run {name_command('ingest')} with other images or masks, then "
+            f"{name_command('sfm')}.")
     psnr_db = {}
     for name, similarity in frames.items():
         there = transformed(splats, similarity.after(moved or Similarity())).map(

@@ -8,6 +8,7 @@ of other proportions, such as a phone held upright, show no more than that.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from recon_cli.io.views import evenly_spread
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.camera_paths import tour_path, tour_seconds
+from recon_cli.scene.faces import pixel_rays
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.format import Guide, Tour
 
@@ -67,7 +69,7 @@ def plan_tour(splats: Splats, cameras: Sequence[Camera], ctx: StageContext) -> T
     distance = float(np.median(known))
     seconds = tour_seconds(tour_path(viewmats, _DRAFT), distance)
     path = tour_path(viewmats, round(seconds / _EVERY) + 1)
-    places = [_placed(lens, viewmat) for viewmat in path]
+    places = [replace(lens, viewmat=viewmat) for viewmat in path]
     margins, shown = [], []
     for place in places:
         wide = _widened(_small(place), _MOST_MARGIN)
@@ -98,10 +100,6 @@ def draw_poster(splats: Splats, tour: Tour, ctx: StageContext) -> bytes:
     return bytes(data)
 
 
-def _placed(lens: Camera, viewmat: NDArray[np.float64]) -> Camera:
-    return Camera(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, viewmat)
-
-
 def _small(camera: Camera) -> Camera:
     scale = _SIDE / max(camera.width, camera.height)
     return camera.resized(max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
@@ -122,9 +120,7 @@ def _surface(splats: Splats, camera: Camera, ctx: StageContext) -> NDArray[np.fl
 
 def _points(camera: Camera, depth: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the points [H, W, 3] of a depth map in the world."""
-    v, u = np.mgrid[:camera.height, :camera.width] + 0.5
-    local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy,
-                      np.ones_like(u)], -1) * depth[..., None]
+    local = pixel_rays(camera) * depth[..., None]
     return np.asarray((local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
 
 
@@ -134,14 +130,8 @@ def _count_views(
     """Returns in how many of the views, with their depth maps, each point [H, W, 3] is seen."""
     count = np.zeros(points.shape[:2], np.int64)
     for camera, depth in zip(cameras, depths, strict=True):
-        local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        z = np.maximum(local[..., 2], 1e-9)
-        u = np.floor(camera.fx * local[..., 0] / z + camera.cx)
-        v = np.floor(camera.fy * local[..., 1] / z + camera.cy)
-        inside = (local[..., 2] > 0) & (u >= 0) & (v >= 0) & (
-            u < camera.width) & (v < camera.height)
-        rows, columns = (np.where(inside, value, 0).astype(np.int64) for value in (v, u))
-        count += inside & (np.abs(depth[rows, columns] - z) <= _SAME * z)
+        rows, column, line, z = camera.find_visible(points.reshape(-1, 3))
+        count.reshape(-1)[rows] += np.abs(depth[line, column] - z) <= _SAME * z
     return count
 
 

@@ -17,17 +17,18 @@ from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import MIN_OPACITY
+from recon_cli.splats.values import measure_extent
 
+VIEW_SIZE = 600  # pixels, longest side of the renders that a file is checked on
 CAMERAS_AROUND = 4  # cameras outside, and as many inside
-_BULK = 0.9  # of the opaque Gaussians lie within the radius; far ones behind windows do not count
-_OPAQUE = 0.5
 _WIDTHS = 3.0  # standard deviations that a radius has at least: centres alone may all be one
 _LEAST_RADIUS = NEAR  # else Gaussians in the middle are too near to be drawn
 _DISTANCE = 2.5  # radii: the bulk and some space around it fill a field of view of 60 degrees
 _HEIGHT = 0.6  # radii, of the cameras outside
 _INSIDE = 0.6  # radii from the middle, within which the emptiest position is searched
 _CANDIDATES = 1000
-_VISIBLE = 0.5 / 255  # coverage that changes an 8-bit image
+VISIBLE = 0.5 / 255  # coverage that changes an 8-bit image
 _FOV_DEG = 60.0
 _ASPECT = 1.5
 _POINTS = 20_000
@@ -45,13 +46,12 @@ def synthetic_scene(
     four stand where there is most space inside and look outward. `up` is a unit vector [3] along z
     or y; `max_size` is the longest side in pixels.
     """
-    opaque = splats.opacities >= _OPAQUE
+    opaque = splats.opacities >= MIN_OPACITY
     used = opaque if bool(opaque.any()) else ~opaque
     means = splats.means[used].double().cpu().numpy()
-    middle = np.median(means, axis=0)
+    middle, bulk = measure_extent(means)
     radius = max(
-        float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK)),
-        _WIDTHS * float(splats.scales[used].amax(dim=1).double().median()), _LEAST_RADIUS)
+        bulk, _WIDTHS * float(splats.scales[used].amax(dim=1).double().median()), _LEAST_RADIUS)
     x_axis = np.array([1.0, 0, 0])
     y_axis = np.cross(up, x_axis)
     angles = np.pi * (0.25 + np.arange(CAMERAS_AROUND) / 2)
@@ -129,5 +129,5 @@ def _render(
     on_device = splats.map(lambda tensor: tensor.to(ctx.device))
     output = render_view(on_device, camera, on_device.sh_degree, ctx.backend)
     image: NDArray[np.float32] = output.rgb.clamp(0, 1).cpu().numpy()
-    visible: NDArray[np.bool_] = (output.alpha > _VISIBLE).cpu().numpy()
+    visible: NDArray[np.bool_] = (output.alpha > VISIBLE).cpu().numpy()
     return image, visible

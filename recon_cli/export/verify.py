@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ReconstructionError, WorkspaceError
+from recon_cli.errors import ReconstructionError, WorkspaceError, name_command
 from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr
 from recon_cli.io.views import MASK_HINT, ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
@@ -71,7 +71,7 @@ def file_size(row: ExportFormat, path: Path) -> int:
     return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
 
 
-def verify_ply(path: Path, splats: Splats, *, again: str = "run `recon export --again`") -> None:
+def verify_ply(path: Path, splats: Splats, *, again: str = "") -> None:
     """Raises WorkspaceError unless a .ply reads back as exactly these Gaussians."""
     back = read_ply(path).with_degree(splats.sh_degree)
     for name, value in splats.parameters().items():
@@ -81,7 +81,7 @@ def verify_ply(path: Path, splats: Splats, *, again: str = "run `recon export --
         if not torch.equal(read, value):
             raise WorkspaceError(
                 f"{path} reads back with a different {name} than was written.",
-                hint=f"Check the disk, then {again}.")
+                hint=f"Check the disk, then {again or 'run ' + name_command('export --again')}.")
 
 
 @dataclass(frozen=True, eq=False)

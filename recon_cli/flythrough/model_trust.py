@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 from recon_cli.context import StageContext
+from recon_cli.errors import name_command
 from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.flythrough.trained_scene import TrainedScene
 from recon_cli.pipeline.execute import Job
@@ -27,7 +28,8 @@ def load_trust(job: Job, trained: TrainedScene, ctx: StageContext) -> Trust:
         trust = Trust.load(folder("evaluate"), trained.model, trained.digest, trained.sh_degree)
     splats = trained.splats.map(lambda tensor: tensor.to(ctx.device))
     if trust is None:
-        logger.info("trust is measured on the training views now; `recon eval` keeps it")
+        logger.info(
+            "trust is measured on the training views now; %s keeps it", name_command("eval"))
         with ctx.progress.bar("trust", views_looked_at(trained.scene), unit="view") as bar:
             config = read_config(folder("train"))
             trust = measure_trust(

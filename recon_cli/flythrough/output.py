@@ -30,6 +30,7 @@ from recon_cli.errors import ConfigError
 from recon_cli.flythrough.request import ALPHA, DEPTH, RGB, TRUST
 from recon_cli.io.images import read_image, to_uint8, write_png
 from recon_cli.render import RenderOutput
+from recon_cli.render.depth_loss import LEAST_COVERAGE
 from recon_cli.scene.camera_paths import visible_depths
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.splats import Splats
@@ -41,8 +42,7 @@ DEPTH_COLOR, TRUST_COLOR = "depth_color", "trust_color"
 VIDEO_FRAMES = {RGB: RGB, DEPTH: DEPTH_COLOR, ALPHA: ALPHA, TRUST: TRUST_COLOR}
 FOLDERS = {RGB: (RGB,), DEPTH: (DEPTH, DEPTH_COLOR), ALPHA: (ALPHA,),
            TRUST: (TRUST, TRUST_COLOR)}
-FARTHEST = 65_535  # steps; greater depths are clipped to it
-_MIN_ALPHA = 0.5  # a pixel with less has no depth
+FARTHEST = int(np.iinfo(np.uint16).max)  # steps; greater depths are clipped to it
 # Quantiles of depth. Where a camera comes close, few points cover much of a picture: the colours
 # begin at half of the first.
 _ENDS = (0.02, 0.98)
@@ -129,7 +129,7 @@ def depth_steps(
 
     0 where alpha is below one half; otherwise clipped to 1 to 65535.
     """
-    covered = alpha >= _MIN_ALPHA
+    covered = alpha >= LEAST_COVERAGE
     mean = depth.astype(np.float64) / np.where(covered, alpha, 1) / step
     return np.where(covered, np.clip(np.rint(mean), 1, FARTHEST), 0).astype(np.uint16)
 

@@ -7,7 +7,7 @@ kept, so an interrupted run continues; with other settings all are rendered agai
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from recon_cli.errors import (
     WorkspaceError,
     format_count,
     list_names,
+    name_command,
 )
 from recon_cli.flythrough.camera_path import write_camera_path
 from recon_cli.flythrough.camera_plan import CameraPlan, check_frame_memory, plan_cameras
@@ -56,9 +57,9 @@ from recon_cli.workspace.atomic import (
     write_json,
 )
 from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.journal import crc32
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
 from recon_cli.workspace.records import find_frames
+from recon_cli.workspace.steps import StepFolder
 
 RECORD = "render.json"
 PATH = "camera_path.json"
@@ -75,6 +76,7 @@ class FrameFolder:
 
     def __init__(self, root: Path, names: Sequence[str], outputs: Sequence[str]) -> None:
         self.root, self.names, self.outputs = root, tuple(names), tuple(outputs)
+        self._steps = StepFolder(root)
         self._folders = [folder for output in outputs for folder in FOLDERS[output]]
 
     def prepare(self, settings: Mapping[str, Any], about: Mapping[str, Any]) -> tuple[str, ...]:
@@ -95,37 +97,25 @@ class FrameFolder:
         clear_leftovers(self.root)
         missing = tuple(name for name in self.names if not all(
             is_whole_png(self.frame_path(folder, name)) for folder in self._folders))
-        known = self._keep_changed(before, missing)
+        self._steps = StepFolder(self.root, key=sha256_json(settings))
+        self._steps.forget(*(name for name in self._pictures if Path(name).stem in missing))
+        if changed := list(self._steps.list_damage()):
+            logger.warning("%s: kept, though not as they were rendered (delete them to render them "
+                           "again): %s", self.root, list_names(changed))
         video = before["video"] if before and not missing else None
         write_json(self.root / RECORD, {
             "digest": sha256_json(settings), "settings": settings, "frames": len(self.names),
-            **about, "video": video, "pictures": known})
+            **about, "video": video})
         for folder in self._folders:
             (self.root / folder).mkdir(exist_ok=True)
         return missing
 
-    def _keep_changed(
-        self, before: Mapping[str, Any] | None, missing: Collection[str]
-    ) -> dict[str, Any]:
-        """Returns the digests of the pictures that stay, and names those that were changed."""
-        recorded = before.get("pictures") if before else None
-        known = recorded if isinstance(recorded, dict) else {}
-        known = {name: known[name] for name in self._pictures
-                 if name in known and Path(name).stem not in missing}
-        changed = [name for name, crc in known.items() if crc32(self.root / name) != crc]
-        if changed:
-            logger.warning("%s: kept, though not as they were rendered (delete them to render them "
-                           "again): %s", self.root, list_names(changed))
-        return known
-
     def record_pictures(self) -> None:
-        """Adds the CRC-32 of every picture that has none in the record yet."""
-        record = self.read_record() or {}
-        known = record.get("pictures", {})
-        pictures = {name: known[name] if name in known else crc32(self.root / name)
-                    for name in self._pictures}
-        if pictures != known:
-            write_json(self.root / RECORD, {**record, "pictures": pictures})
+        """Records the digest of every picture that has none yet."""
+        known = set(self._steps.steps)
+        for name in self._pictures:
+            if name not in known:
+                self._steps.finish(name, paths=[self.root / name])
 
     @property
     def _pictures(self) -> list[str]:
@@ -200,8 +190,9 @@ def render_frames(request: RenderRequest, job: Job) -> str:
                 VIDEO_FRAMES[frames.outputs[0]], frames.names[0]), request.out_file)
         files = [request.out_file]
     if request.out_file is not None:
-        logger.info("%s of frames stay in %s to continue from; `recon clean --renders` frees them",
-                    format_megabytes(layout.size_of(frames.root)), frames.root)
+        logger.info("%s of frames stay in %s to continue from; %s frees them",
+                    format_megabytes(layout.size_of(frames.root)), frames.root,
+                    name_command("clean --renders"))
     return "\n".join([
         f"{format_count(len(frames.names), 'frame')} in {frames.root}, {len(missing)} of them "
         "rendered now", *map(str, files)])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.context import StageInputs
-from recon_cli.errors import ManifestError, StageError
+from recon_cli.errors import ManifestError, StageError, name_command
 from recon_cli.export.synthetic_cameras import synthetic_scene
 from recon_cli.io.training_scene import load_scene
 from recon_cli.pipeline import plan
@@ -22,7 +22,7 @@ from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit.train_data import read_config
 from recon_cli.trust.scene_trust import digest_of
 from recon_cli.workspace.manifest import Manifest
-from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord
+from recon_cli.workspace.records import ImportRecord, need_views
 from recon_cli.workspace.summaries import PlaceSummary
 
 _NEEDS = ("ingest", "train", "place")  # training runs place first where that is missing too
@@ -77,7 +77,7 @@ def open_trained_scene(job: Job, model: str, *, verb: str = "render") -> Trained
     if viewless and model == "pruned":
         raise StageError(
             "This workspace has no compact (pruned) model: a scene without views cannot be pruned.",
-            hint=NEEDS_VIEWS_HINT)
+            hint=need_views())
     pruned = not viewless and _use_pruned(inspection, model, verb)
     config = read_config(folder("train"))
     splats = read_ply(folder("prune" if pruned else "train") / "splats.ply")
@@ -108,7 +108,7 @@ def _use_pruned(inspection: WorkspaceCheck, model: str, verb: str) -> bool:
     if model == "pruned" and not check.usable:
         raise StageError(
             f"{verb} needs the compact (pruned) model, which is {check.describe()}.",
-            hint=f"Run `recon prune` first, or `recon {verb} --model base`.")
+            hint=f"Run {name_command('prune')} first, or {name_command(f'{verb} --model base')}.")
     if model == "auto" and check.manifest and not check.usable:
         logger.warning("the compact (pruned) model is not used: it is %s", check.describe())
     return check.usable and model != "base"

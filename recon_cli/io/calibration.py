@@ -120,10 +120,9 @@ def undistort_pixels(
     of a pixel that no direction is shown at.
     """
     # `recon convert` reads poses too, and starts without it
-    from recon_cli.io.colmap_library import pycolmap
+    from recon_cli.io.depth_maps import lens_camera
 
-    camera = pycolmap.Camera(
-        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+    camera = lens_camera(lens)
     undone = np.array(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
     again = np.array(camera.img_from_cam(np.column_stack([undone, np.ones(len(undone))])))
     found = np.abs(again.reshape(-1, 2) - pixels).max(axis=1, initial=0.0) <= _MISS

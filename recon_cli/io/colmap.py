@@ -6,7 +6,6 @@ import os
 import shutil
 import struct
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, Hint, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.face_frames import read_face_frames
-from recon_cli.scene.camera import Camera, Lens
+from recon_cli.scene.camera import MODELS, Camera, Lens, make_lens
 from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
 from recon_cli.workspace.paths import refuse_special
 
-_PINHOLE = 1  # COLMAP's id of the model with fx, fy, cx, cy
-_HINT = "Run `recon sfm --again`."
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Intrinsics in pixels; the centre of the first pixel is at 0.5."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+# COLMAP's camera models by their ids, src/colmap/sensor/models.h and pycolmap 4.2's CameraModelId
+_MODELS = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
+    "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE",
+    "EUCM", "EQUIRECTANGULAR",
+)
+_HINT = Hint("sfm", again=True)
 
 
 def read_scene(
@@ -56,8 +49,8 @@ def read_scene(
     sparse = undistorted / "sparse" if sparse is None else sparse
     twins = undistorted / "denoised" if denoised is None else denoised
     views, frames = [], read_face_frames(undistorted)
-    for name, inner, viewmat in _read_views(sparse):
-        camera = Camera(inner.width, inner.height, inner.fx, inner.fy, inner.cx, inner.cy, viewmat)
+    for name, lens, viewmat in _read_views(sparse):
+        camera = lens.pinhole(viewmat)
         mask = undistorted / "masks" / name
         view = View(name, camera, undistorted / "images" / name, twins / name,
                     mask if mask.exists() else None, frames.get(name))
@@ -72,56 +65,57 @@ def read_scene(
     return Scene(train, chosen, test, tuple(missing), points, colors, sparse=sparse)
 
 
-def read_pinholes(sparse: Path) -> dict[str, Pinhole]:
-    """Returns the camera of each view of an undistorted model, by name."""
-    return {name: pinhole for name, pinhole, _ in _read_views(sparse)}
+def read_pinholes(sparse: Path) -> dict[str, Lens]:
+    """Returns the lens of each view of an undistorted model, by name."""
+    return {name: lens for name, lens, _ in _read_views(sparse)}
 
 
-def _read_views(sparse: Path) -> list[tuple[str, Pinhole, NDArray[np.float64]]]:
-    """Returns the name, camera and [4, 4] world to camera of each view."""
-    cameras = read_cameras(sparse / "cameras.bin")
+def _read_views(sparse: Path) -> list[tuple[str, Lens, NDArray[np.float64]]]:
+    """Returns the name, lens and [4, 4] world to camera of each view."""
+    lenses = read_lenses(sparse / "cameras.bin")
+    for number, lens in lenses.items():
+        if lens.model != "PINHOLE":
+            raise FormatError(
+                f"{sparse / 'cameras.bin'} holds a camera {number} of the model {lens.model}, but "
+                "only undistorted pinhole cameras can be trained on.", hint=_HINT)
     images = read_images(sparse / "images.bin")
     for name, camera_id, _ in images:
-        if camera_id not in cameras:
+        if camera_id not in lenses:
             raise model_error(sparse, f"{name} has the unknown camera {camera_id}", _HINT)
-    return [(name, cameras[camera_id], viewmat) for name, camera_id, viewmat in images]
+    return [(name, lenses[camera_id], viewmat) for name, camera_id, viewmat in images]
 
 
-def read_cameras(path: Path) -> dict[int, Pinhole]:
-    """Returns the cameras of a cameras.bin by id; FormatError unless all are pinholes."""
-    reader = Reader(path, _HINT)
-    cameras = {}
+def read_lenses(path: Path, *, hint: str | Hint = _HINT) -> dict[int, Lens]:
+    """Returns the intrinsics of a cameras.bin by camera id."""
+    reader = Reader(path, hint)
+    lenses = {}
     for _ in range(reader.count(minimum=24)):
         camera_id, model, width, height = reader.take("<IiQQ")
-        if model != _PINHOLE:
-            raise FormatError(
-                f"{path} holds a camera of COLMAP's model {model}, but only undistorted pinhole "
-                f"cameras (model {_PINHOLE}) can be trained on.", hint=_HINT)
-        fx, fy, cx, cy = reader.take("<4d")
-        cameras[camera_id] = Pinhole(width, height, fx, fy, cx, cy)
+        name = _MODELS[model] if 0 <= model < len(_MODELS) else str(model)
+        params = reader.take(f"<{MODELS[name][1]}d") if name in MODELS else ()
+        lenses[camera_id] = make_lens(name, width, height, params, f"{path}, camera {camera_id},")
     reader.end()
-    return cameras
+    return lenses
 
 
-def read_images(path: Path, *, hint: str = _HINT) -> list[tuple[str, int, NDArray[np.float64]]]:
+def read_images(
+    path: Path, *, hint: str | Hint = _HINT
+) -> list[tuple[str, int, NDArray[np.float64]]]:
     """Returns (name, camera id, [4, 4] world to camera) of each image of an images.bin."""
-    reader = Reader(path, hint)
     images = []
-    for _ in range(reader.count(minimum=73)):
-        _, *pose, camera_id = reader.take("<I7dI")
-        name = reader.text()
-        reader.skip(24 * reader.count(minimum=24))  # x, y and point id of each observation
+    for _, name, camera_id, pose in _read_image_rows(path, hint):
         viewmat = pose_matrix(pose)
         if viewmat is None:
             raise model_error(path, f"no pose of {name}", hint)
         images.append((name, camera_id, viewmat))
-    reader.end()
     return images
 
 
-def read_points(path: Path, *, hint: str = _HINT) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def read_points(
+    path: Path, *, hint: str | Hint = _HINT
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Returns positions [P, 3] and RGB colours [P, 3] of a points3D.bin, sorted by point id."""
-    rows = sorted(row[:7] for row in _read_point_rows(path, hint))
+    rows = [row for row, _ in _read_point_rows(path, hint)]
     positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(positions).all():
         raise model_error(path, "a point that is not finite", hint)
@@ -133,38 +127,11 @@ def read_visibility(sparse: Path) -> dict[str, NDArray[np.int64]]:
 
     FormatError if the model is missing or damaged.
     """
-    reader = Reader(sparse / "images.bin", _HINT)
-    names = {}
-    for _ in range(reader.count(minimum=73)):
-        number = reader.take("<I7dI")[0]
-        names[number] = reader.text()
-        reader.skip(24 * reader.count(minimum=24))
-    reader.end()
-    reader = Reader(sparse / "points3D.bin", _HINT)
-    ids, tracks = [], []
-    for _ in range(reader.count(minimum=51)):
-        ids.append(reader.take("<Q3d3Bd")[0])
-        length = reader.count(minimum=8)
-        tracks.append(np.array(reader.take(f"<{2 * length}I"), np.int64)[::2])
-    reader.end()
-    order = np.argsort(ids, kind="stable")
-    rows = np.repeat(np.arange(len(ids)), [len(tracks[i]) for i in order])
-    views = np.concatenate([np.empty(0, np.int64), *(tracks[i] for i in order)])
-    by_view = np.argsort(views, kind="stable")
-    rows, views = rows[by_view], views[by_view]
-    return {name: np.unique(rows[slice(*np.searchsorted(views, [number, number + 1]))])
-            for number, name in names.items()}
-
-
-def _read_point_rows(path: Path, hint: str) -> list[tuple[Any, ...]]:
-    """Returns id, position, colour and error of each point."""
-    reader = Reader(path, hint)
-    rows = []
-    for _ in range(reader.count(minimum=51)):
-        rows.append(reader.take("<Q3d3Bd"))
-        reader.skip(8 * reader.count(minimum=8))  # image id and observation of each in the track
-    reader.end()
-    return rows
+    names, _, seen = read_observations(sparse)
+    order = np.argsort(seen.view, kind="stable")
+    ends = np.searchsorted(seen.view[order], np.arange(len(names) + 1))
+    return {name: np.unique(seen.point[order[start:end]])
+            for name, start, end in zip(names, ends[:-1], ends[1:], strict=True)}
 
 
 def read_observations(
@@ -172,18 +139,42 @@ def read_observations(
 ) -> tuple[list[str], NDArray[np.float64], Observations]:
     """Returns the names of the views, the points [P, 3] and which view sees which point.
 
-    Views are sorted by name, and points by their id, as `read_points` sorts them.
+    Views are sorted by name, and points by their id, as `read_points` sorts them. FormatError if
+    the model is missing or damaged.
     """
-    model = pycolmap.Reconstruction(sparse)
-    names = sorted(model.image(number).name for number in model.reg_image_ids())
-    rows = {name: row for row, name in enumerate(names)}
-    views = {number: rows[model.image(number).name] for number in model.reg_image_ids()}
-    ids = sorted(model.points3D)
-    seen = [(views[element.image_id], row) for row, number in enumerate(ids)
-            for element in model.point3D(number).track.elements]
-    view, point = np.array(seen, np.int64).reshape(-1, 2).T
-    points = np.array([model.point3D(number).xyz for number in ids]).reshape(-1, 3)
-    return names, points, Observations(view, point, len(names), len(ids))
+    names = {number: name for number, name, *_ in _read_image_rows(sparse / "images.bin", _HINT)}
+    points = _read_point_rows(sparse / "points3D.bin", _HINT)
+    rows = {number: row for row, number in enumerate(sorted(names, key=names.__getitem__))}
+    if unknown := {number for _, track in points for number in track} - rows.keys():
+        raise model_error(sparse, f"points of the unknown image {min(unknown)}", _HINT)
+    views = np.array([rows[number] for _, track in points for number in track], np.int64)
+    point = np.repeat(np.arange(len(points)), [len(track) for _, track in points])
+    positions = np.array([row[1:4] for row, _ in points], np.float64).reshape(-1, 3)
+    return sorted(names.values()), positions, Observations(views, point, len(names), len(points))
+
+
+def _read_image_rows(
+    path: Path, hint: str | Hint
+) -> list[tuple[int, str, int, list[float]]]:
+    """Returns id, name, camera id, and quaternion and translation of each image."""
+    reader, images = Reader(path, hint), []
+    for _ in range(reader.count(minimum=73)):
+        number, *pose, camera_id = reader.take("<I7dI")
+        images.append((number, reader.text(), camera_id, pose))
+        reader.skip(24 * reader.count(minimum=24))  # x, y and point id of each observation
+    reader.end()
+    return images
+
+
+def _read_point_rows(path: Path, hint: str | Hint) -> list[tuple[tuple[Any, ...], tuple[int, ...]]]:
+    """Returns id, position and colour of each point, and the images of its track; by the ids."""
+    reader, rows = Reader(path, hint), []
+    for _ in range(reader.count(minimum=51)):
+        row = reader.take("<Q3d3Bd")[:7]
+        length = reader.count(minimum=8)  # image id and observation of each
+        rows.append((row, reader.take(f"<{2 * length}I")[::2]))
+    reader.end()
+    return sorted(rows)
 
 
 def write_part(
@@ -236,7 +227,7 @@ def write_colmap(
     observations are written. InputError if there are no views, or the folder holds something.
     """
     if not views:
-        raise InputError("There are no cameras to write.", hint="Run `recon sfm` first.")
+        raise InputError("There are no cameras to write.", hint=Hint("sfm", then=" first"))
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder} is not empty.", hint="Name another folder, or remove it.")
     model = _model(views)
@@ -295,13 +286,6 @@ def _prior(
     return prior
 
 
-def project(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the pixels [M, 2] of points [M, 3] in a camera's axes, all before it."""
-    camera = pycolmap.Camera(
-        model=lens.model, width=lens.width, height=lens.height, params=lens.params)
-    return np.asarray(camera.img_from_cam(points))
-
-
 def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:
     model, ids = pycolmap.Reconstruction(), dict[tuple[float, ...], int]()
     for number, (name, camera) in enumerate(views, start=1):
@@ -320,7 +304,7 @@ def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:
 class Reader:
     """Reads values from a binary file, and refuses one that ends too soon or too late."""
 
-    def __init__(self, path: Path, hint: str) -> None:
+    def __init__(self, path: Path, hint: str | Hint) -> None:
         self._path = path
         self._hint = hint
         self._at = 0
@@ -376,6 +360,6 @@ def pose_matrix(pose: Sequence[float]) -> NDArray[np.float64] | None:
     return matrix
 
 
-def model_error(path: Path, fault: str, hint: str) -> FormatError:
+def model_error(path: Path, fault: str, hint: str | Hint) -> FormatError:
     """Returns the error for a damaged file."""
     return FormatError(f"{path} is not a complete COLMAP model: {fault}.", hint=hint)

@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.colmap import Reader, model_error, pose_matrix, read_images, read_points
-from recon_cli.scene.camera import MODELS, Lens, make_lens
+from recon_cli.io.colmap import (
+    Reader,
+    model_error,
+    pose_matrix,
+    read_images,
+    read_lenses,
+    read_points,
+)
+from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace.paths import refuse_special
 
-# COLMAP's ids of its camera models, src/colmap/sensor/models.h and pycolmap 4.2's CameraModelId.
-_IDS = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
-    "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE",
-    "EUCM", "EQUIRECTANGULAR",
-)
 _SENSORS = {0: "CAMERA", 1: "IMU"}
 _HINT = "Copy the model again, or export it again from COLMAP."
 _TEXT_HINT = "Export the model again from COLMAP."
@@ -85,7 +85,7 @@ def read_model(folder: Path) -> Model:
     binary = suffix == ".bin"
     cameras, images, points = (
         folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
-    lenses = _read_lenses(cameras) if binary else _read_cameras_text(cameras)
+    lenses = read_lenses(cameras, hint=_HINT) if binary else _read_cameras_text(cameras)
     named: list[NamedImage] = []
     unnamed: dict[int, tuple[int, Pose]] = {}
     if images.is_file():
@@ -120,18 +120,6 @@ def _compose(folder: Path, *, binary: bool) -> dict[int, tuple[int, Pose]]:
                     rigs_file, f"no pose of camera {sensor[1]} in rig {rig_id}", _HINT)
             poses[image_id] = sensor[1], sensor_from_rig @ rig_from_world
     return dict(sorted(poses.items()))
-
-
-def _read_lenses(path: Path) -> dict[int, Lens]:
-    reader = Reader(path, _HINT)
-    lenses = {}
-    for _ in range(reader.count(minimum=24)):
-        camera_id, model, width, height = reader.take("<IiQQ")
-        name = _IDS[model] if 0 <= model < len(_IDS) else str(model)
-        params = reader.take(f"<{MODELS[name][1]}d") if name in MODELS else ()
-        lenses[camera_id] = make_lens(name, width, height, params, f"{path}, camera {camera_id},")
-    reader.end()
-    return lenses
 
 
 def _read_rigs(path: Path) -> Rigs:

@@ -2,7 +2,7 @@
 
 ingest writes depth.json and depth/, for all frames that the data set itself does not hold out; who
 trains leaves out those that --holdout does. A map is a PNG of 16 bits, named like its frame; levels
-of confidence (0 low, 1 medium, 2 high) lie beside it as 8 bits.
+of confidence lie beside it as 8 bits.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from recon_cli.io.images import decode_file, write_png
 from recon_cli.scene.camera import Lens, make_lens
 from recon_cli.workspace import atomic
 from recon_cli.workspace.json_record import JsonRecord
-from recon_cli.workspace.records import AGAIN
+from recon_cli.workspace.records import AGAIN, Confidence
 
 DEPTH, LIST = "depth", "depth.json"
 MEDIAN = 5  # pixels a side of the median that takes a sensor's noise, and leaves edges
-_MOST = 65535  # value of 16 bits
+_MOST = int(np.iinfo(np.uint16).max)
 _WHOLE = 0.02  # of a unit: what float32 leaves of a multiple
 _CONFIDENCE = ".confidence.png"
-SURE = 2  # level of confidence, of 0 to 2
+LEAST_POINTS = 20  # of a view, by which its own depth is judged
 # Relative noise at the points of a model, beyond which depth is not of this model, or tells less
 # than the images: phones have about .01, cheap cameras .03.
 MOST_NOISE = 0.1
@@ -107,7 +107,7 @@ def read_sure_depth(ingest: Path, name: str, one: DepthMap) -> NDArray[np.float3
     """Returns the depth [h, w] of a frame in world units, 0 where it is not sure or too far."""
     depth, levels = read_depth(ingest, name, one)
     if levels is not None:
-        depth[levels < SURE] = 0
+        depth[levels < Confidence.HIGH] = 0
     if one.reliable is not None:
         depth[depth > one.reliable] = 0
     return depth
@@ -117,6 +117,20 @@ def lens_camera(lens: Lens) -> pycolmap.Camera:
     """Returns the camera of a lens, as of a depth map."""
     return pycolmap.Camera(
         model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+
+
+def find_visible(
+    camera: pycolmap.Camera, local: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Returns the rows of points [P, 3] in a camera's axes that it shows, and columns and lines.
+
+    As `Camera.find_visible`, for any lens; not those that it has no pixel for.
+    """
+    rows = np.flatnonzero(local[:, 2] > 0)
+    pixels = np.asarray(camera.img_from_cam(local[rows])).reshape(-1, 2)
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    columns, lines = pixels[inside].astype(np.int64).T
+    return rows[inside], columns, lines
 
 
 def find_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:

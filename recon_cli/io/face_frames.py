@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.workspace.atomic import read_json, write_json
 
 FILE = "faces.json"
-_HINT = "Run `recon sfm --again`."
+_HINT = Hint("sfm", again=True)
 
 
 def write_face_frames(undistorted: Path, frames: Mapping[str, str]) -> None:

@@ -13,13 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import read_bytes, write_bytes
 from recon_cli.workspace.records import AGAIN
 
-_COUNTS = 255  # in a mask file; anything less is ignored, half-covered edges included
 _PNG = b"\x89PNG\r\n\x1a\n"  # what every PNG begins with
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 
@@ -49,7 +48,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     A pixel of the reduced mask counts only if all pixels that it covers do.
     """
     data = _read(path, cv2.IMREAD_GRAYSCALE, "a mask")
-    ignored = (data < _COUNTS).astype(np.float32)
+    ignored = (data < 255).astype(np.float32)  # half-covered edges included
     if data.shape != (height, width):
         # zeros alone average to exactly 0; the mean of bytes would round a sliver away
         ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
@@ -59,7 +58,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
 def _read(path: Path, flags: int, kind: str) -> NDArray[np.uint8]:
     data = decode_file(path, flags)
     if data is None:
-        raise FormatError(f"{path} cannot be read as {kind}.", hint="Run `recon sfm --again`.")
+        raise FormatError(f"{path} cannot be read as {kind}.", hint=Hint("sfm", again=True))
     return data
 
 

@@ -23,7 +23,8 @@ _CODES = np.arange(256) / 255
 _LIGHT = np.where(
     _CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4).astype(np.float32)
 _MIMES = {"png": "image/png", "jpg": "image/jpeg"}
-_LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071  # filters and wrapping of WebGL
+# Linear filters, with mipmaps, without wrapping; codes of WebGL.
+_SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
 _TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 # trimesh writes colours in 8 bits alone and turns texture coordinates, so both go in as attributes
@@ -60,8 +61,7 @@ def glb_bytes(mesh: Mesh, tint: tuple[float, float, float] | None) -> bytes:
         buffers["image"] = data + bytes(-len(data) % 4)
         tree["images"] = [
             {"bufferView": len(buffers) - 1, "mimeType": _MIMES[mesh.texture.kind]}]
-        tree["samplers"] = [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS,
-                             "wrapS": _CLAMP, "wrapT": _CLAMP}]
+        tree["samplers"] = [_SAMPLER]
         tree["textures"] = [{"source": 0, "sampler": 0}]
 
     def add_materials(tree: dict[str, Any]) -> None:

@@ -14,8 +14,6 @@ from recon_cli.io.images import decode_file, encode_image
 from recon_cli.io.mesh_data import Mesh, Texture
 from recon_cli.workspace.atomic import write_bytes
 
-_LARGEST = 1 << 31  # a number of a vertex
-
 
 def write_obj(path: Path, mesh: Mesh, tint: tuple[float, float, float] | None) -> None:
     """Writes a mesh; `tint` is the colour of the material `inferred`."""
@@ -75,7 +73,7 @@ def read_obj(path: Path) -> Mesh:
             materials.append(len(kinds["f"]))
     vertices = _numbers(kinds["v"], 6)
     faces = _numbers([line.replace("/", " ") for line in kinds["f"]], 6 if kinds["vt"] else 3)
-    if len(faces) and not (faces >= 1).all() & (faces < _LARGEST).all():
+    if len(faces) and not (faces >= 1).all() & (faces <= np.iinfo(np.int32).max).all():
         raise ValueError("numbers of vertices are broken")
     faces = faces[:, ::2] if kinds["vt"] else faces
     triangles = faces.astype(np.int64) - 1

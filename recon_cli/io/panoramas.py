@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -29,12 +30,11 @@ def stitch_faces(
     for place, (picture, camera) in enumerate(zip(pictures, cameras, strict=True)):
         own = nearest == place
         local = rays[own] @ camera.viewmat[:3, :3].T
-        depth = np.maximum(local[:, 2], 1e-9)
-        x = local[:, 0] / depth * camera.fx + camera.cx
-        y = local[:, 1] / depth * camera.fy + camera.cy
-        inside = (x > -0.5) & (x < camera.width + 0.5) & (y > -0.5) & (y < camera.height + 0.5)
-        places = np.stack([x, y], axis=1)[:, None].astype(np.float32) - np.float32(0.5)
-        panorama[own] = _sample(picture, places) * inside[:, None]
+        pixels, _ = replace(camera, viewmat=np.eye(4)).project(local)
+        ends = np.array((camera.width + 0.5, camera.height + 0.5))
+        inside = np.all((pixels > -0.5) & (pixels < ends), axis=1, keepdims=True)
+        places = np.nan_to_num(pixels)[:, None].astype(np.float32) - np.float32(0.5)
+        panorama[own] = _sample(picture, places) * inside
     return panorama
 
 

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.depth_maps import (
+    LEAST_POINTS,
     MEDIAN,
     MOST_NOISE,
     DepthMap,
     find_edges,
+    find_visible,
     lens_camera,
     read_depth_list,
     read_sure_depth,
@@ -32,9 +34,8 @@ from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import SensorDepth
 
 MOST_SAMPLES = 16_000  # of a map, for training: one for 4 to 13 pixels of an image
-SAMPLE_BYTES = 12  # ray and depth
+SAMPLE_BYTES = 3 * np.dtype(np.float32).itemsize  # ray and depth
 ALL_SAMPLES = 400_000  # for meshes: every pixel of the sensors of phones and cheap cameras
-LEAST_POINTS = 20  # of a view, by which its own depth is judged
 FEWEST_POINTS = 200  # of all views
 MOST_POINTS = 4000  # looked at where no tracks say what views see
 LEAST_NOISE = 0.002  # relative; what depth of 16 bits and the nearest pixel leave
@@ -99,14 +100,8 @@ def _compare(
 ) -> NDArray[np.float64]:
     """Returns the sensor's depth over the model's at points [P, 3], where both are known."""
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    local = local[local[:, 2] > 0]
-    if not len(local):
-        return np.empty(0)
-    at = np.asarray(lens_camera(lens).img_from_cam(local)).reshape(-1, 2)
-    at = np.nan_to_num(at, nan=-1)
-    inside = ((at >= 0) & (at < (lens.width, lens.height))).all(axis=1)
-    column, row = at[inside].astype(np.intp).T
-    theirs, ours = depth[row, column].astype(np.float64), local[inside, 2]
+    rows, column, line = find_visible(lens_camera(lens), local)
+    theirs, ours = depth[line, column].astype(np.float64), local[rows, 2]
     return np.asarray(theirs[theirs > 0] / ours[theirs > 0])
 
 

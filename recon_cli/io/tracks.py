@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.workspace import atomic
 
 TRACKS = "tracks.safetensors"
@@ -80,7 +80,7 @@ class Tracks:
                 image, track, xy = (file.get_tensor(name) for name in ("image", "track", "xy"))
         except (KeyError, TypeError, ValueError, OSError, SafetensorError) as error:
             raise FormatError(
-                f"{path} holds no tracks.", hint="Run `recon ingest --again`.") from error
+                f"{path} holds no tracks.", hint=Hint("ingest", again=True)) from error
         return cls(tuple(names), image, track, xy)
 
 

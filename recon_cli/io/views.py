@@ -7,13 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from recon_cli.errors import Hint
 from recon_cli.io.images import fit_camera, read_masked_image
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.image_file import ImageFile
 from recon_cli.scene.scene import View
 from recon_cli.scene.train_view import MIN_PIXELS, TrainView, leaves_enough
 
-MASK_HINT = "Run `recon ingest` with masks that hide less."
+MASK_HINT = Hint("ingest", then=" with masks that hide less")
 _Item = TypeVar("_Item")
 
 
@@ -56,6 +57,12 @@ def load_views(
 def evenly_spread(items: Sequence[_Item], most: int) -> Sequence[_Item]:
     """Returns at most `most` of the items, evenly spread."""
     return items[:: max(1, -(-len(items) // most))]
+
+
+def spread_inside(items: Sequence[_Item], count: int) -> list[_Item]:
+    """Returns `count` of the items, or all: the middles of so many runs of one length."""
+    count = min(count, len(items))
+    return [items[int((at + 0.5) * len(items) / count)] for at in range(count)]
 
 
 def size_summary(cameras: Sequence[Camera]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+AT_ONCE = 128  # rows, triangles or blocks that a thread takes at a time
 SCRATCH_FLOATS = 1 << 14  # 64 KB: no kernel needs more; what it uses all the time stays in L1
 Kernel = Callable[..., Any]
 

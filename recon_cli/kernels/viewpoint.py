@@ -8,7 +8,7 @@ import numpy as np
 
 from recon_cli.scene.camera import Camera
 
-_MARGIN = 0.15  # of the image on each side, within which x/z and y/z are clamped
+MARGIN = 0.15  # of the image on each side, within which x/z and y/z are clamped
 
 
 class Viewpoint(NamedTuple):
@@ -31,7 +31,7 @@ class Viewpoint(NamedTuple):
 
 def viewpoint(camera: Camera) -> Viewpoint:
     """Returns a camera as kernels take it."""
-    wide, high = _MARGIN * camera.width, _MARGIN * camera.height
+    wide, high = MARGIN * camera.width, MARGIN * camera.height
     return Viewpoint(
         np.ascontiguousarray(camera.viewmat[:3, :3], np.float64).reshape(-1),
         np.ascontiguousarray(camera.viewmat[:3, 3], np.float64),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon_cli.errors import ManifestError, StageError
+from recon_cli.errors import Hint, ManifestError, StageError
 from recon_cli.pipeline.execute import Job
 from recon_cli.stages import Stage
 from recon_cli.workspace.digests import matches
@@ -83,7 +83,7 @@ def _all_but_exports(job: Job) -> list[str]:
     if job.workspace.manifest(_EXPORT) is None:
         raise StageError(
             f"{job.workspace.root} holds no exported scene to keep.",
-            hint="Run `recon export` first, or name the stages to remove.")
+            hint=Hint("export", then=" first, or name the stages to remove"))
     return [row.name for row in job.table if row.name != _EXPORT]
 
 

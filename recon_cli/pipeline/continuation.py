@@ -11,7 +11,7 @@ import dataclasses
 import logging
 from enum import Enum
 
-from recon_cli.errors import ManifestError, StageError
+from recon_cli.errors import Hint, ManifestError, StageError, name_command
 from recon_cli.stages import IMPORT, Stage
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import (
@@ -90,7 +90,7 @@ def find_start(workspace: Workspace, row: Stage, key: ResultKey, start: Start) -
     if start is Start.IMPORTED and not origin:
         raise StageError(
             f"{workspace.root} holds no imported scene to start from.",
-            hint="Run `recon import FILE` first.")
+            hint=Hint("import", "FILE", then=" first"))
     if finished is None:
         return None
     reasons = _obstacles(workspace, row, key, finished)
@@ -100,8 +100,9 @@ def find_start(workspace: Workspace, row: Stage, key: ResultKey, start: Start) -
         raise StageError(
             f"{workspace.root} holds the scene imported from {origin}, trained further, which "
             f"would be lost: {'; '.join(reasons)}.",
-            hint=f"Run `recon import {origin} --again` and `recon train --from-import`, or train "
-            "without it by `recon train --again`.")
+            hint=f"Run {name_command(f'import {origin} --again')} and "
+            f"{name_command('train --from-import')}, or train "
+            f"without it by {name_command('train --again')}.")
     if _is_longer(key, finished):
         logger.info("%s begins anew: %s", row.name, "; ".join(reasons))
     return None
@@ -129,7 +130,7 @@ def _find_imported(
     if reasons:
         raise StageError(
             f"The scene imported from {name} is stale: {'; '.join(reasons)}.",
-            hint="Run `recon import` first.")
+            hint=Hint("import", then=" first"))
     return finished.digest
 
 

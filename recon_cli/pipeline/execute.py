@@ -20,7 +20,7 @@ from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import EarlierResult, StageContext, StageInputs, TrainCallback
 from recon_cli.deadline import Deadline
-from recon_cli.errors import ConfigError, InputError, ManifestError, ReconError
+from recon_cli.errors import ConfigError, InputError, ManifestError, ReconError, name_command
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.progress import NullProgress, Progress, in_stage
@@ -226,7 +226,7 @@ def _read_last_sources(job: Job, row: Stage) -> tuple[Source, ...]:
         verb = "run" if len(job.asked) > 1 else row.verb
         raise ConfigError(
             f"{verb} needs an input: none was given, and {job.workspace.root} has no previous one.",
-            hint=f"Type `recon {verb} {row.input_metavar}`"
+            hint=f"Type {name_command(f'{verb} {row.input_metavar}')}"
             f"{', or a folder of photos in place of VIDEO' * (row.input_metavar == 'VIDEO')}.")
     return tuple(
         read_source(Path(source.path), known=source, without=job.workspace.root)

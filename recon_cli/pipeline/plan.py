@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.config.fields import OptionInfo, StageConfig, option_info
-from recon_cli.errors import ReconError, StageError, WorkspaceError
+from recon_cli.errors import Hint, ReconError, StageError, WorkspaceError, name_command
 from recon_cli.pipeline.compile_ahead import compile_ahead
 from recon_cli.pipeline.continuation import Start, is_imported, may_resume
 from recon_cli.pipeline.execute import Job, Outcome, last_sources, refuse_missing_backend, run_stage
@@ -181,11 +181,12 @@ def refuse_to_replace(job: Job, verb: str, stages: Sequence[str]) -> None:
             scene = f"a training that was interrupted at {partial.done} of {partial.total}"
         else:
             continue
-        further = "" if importing else ", train it further by `recon train --from-import`"
+        further = "" if importing else (
+            f", train it further by {name_command('train --from-import')}")
         raise StageError(
             f"{job.workspace.root} holds {scene}, which `recon {verb}` would replace.",
-            hint=f"Give another workspace with -w{further}, or replace it by `recon {verb} "
-            "--again`.")
+            hint=f"Give another workspace with -w{further}, or replace it by "
+            f"{name_command(f'{verb} --again')}.")
 
 
 def plan(checks: WorkspaceCheck, stage: str) -> tuple[Stage, ...]:
@@ -231,7 +232,7 @@ def require(
 def _need_error(checks: WorkspaceCheck, check: StageCheck, reader: str) -> StageError:
     """Returns the error of a result that `reader` cannot take; its hint costs no training."""
     scene = checks.finished_scene
-    hint = f"Run `{command(checks, check)}` first."
+    hint = str(Hint(command(checks, check), then=" first"))
     if scene and check.usable:
         hint = (f"The scene in {scene} can be viewed, rendered, scored and exported as it is. "
                 "To train with this version of recon, read the capture into another workspace "
@@ -244,8 +245,8 @@ def _need_error(checks: WorkspaceCheck, check: StageCheck, reader: str) -> Stage
 
 
 def command(checks: WorkspaceCheck, check: StageCheck) -> str:
-    """Returns the command that brings a stage up to date with the options it had."""
-    words = ["recon", check.row.verb]
+    """Returns the command, without `recon`, that updates a stage with the options it had."""
+    words = [check.row.verb]
     found = [(one.row, latest) for one in checks.siblings(check.row)
              if (latest := one.partial_run or one.manifest)]
     if not found:
@@ -302,7 +303,7 @@ def _require_states(job: Job, checks: WorkspaceCheck, row: Stage) -> None:
                     job.workspace.folder(check.row.name) / name).exists():
                 raise StageError(
                     f"{row.verb} starts from {check.row.name}/{name}, which was removed.",
-                    hint=f"Run `{command(checks, check)} --again` first.")
+                    hint=Hint(command(checks, check), again=True, then=" first"))
 
 
 def _run_if_needed(job: Job, row: Stage) -> Iterator[Outcome]:

@@ -79,7 +79,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class BatchLayout:
     """The pairs of a camera and a Gaussian that it shows, and how the caller gets their rows."""
 
     camera_ids: Tensor  # [nnz] int64, ascending
@@ -119,7 +119,7 @@ class Batch:
                 for c, numbers in enumerate(zip(poses, intrinsics, strict=True))]
             self._images = torch.stack([view.image for view in self.views])
             self._alphas = torch.stack([view.alpha for view in self.views])[..., None]
-        self.layout = Layout(
+        self.layout = BatchLayout(
             torch.cat([torch.full_like(view.ids, c) for c, view in enumerate(self.views)]),
             torch.cat([view.ids for view in self.views]), (len(poses), len(inputs.means)), packed)
 

@@ -15,15 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon_cli.errors import BackendError, ConfigError, InputError
+from recon_cli.errors import BackendError, ConfigError, InputError, name_command
 from recon_cli.render.camera_batch import Batch, BatchOptions, Gaussians
 from recon_cli.render.contract import DILATION
 from recon_cli.render.rasterization_meta import view_meta
 from recon_cli.render.registry import kernels_to_compile, prepare, resolve
+from recon_cli.scene.splats import TERMS
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 _MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-_HIGHEST_DEGREE = 3
+_HIGHEST_DEGREE = len(TERMS) - 1
 _SMALLEST_ALPHA = 1e-10  # the expected depth is divided by no smaller one, as gsplat does
 _TOLERANCE = 1e-2  # of a rotation: an optimizer's steps leave a matrix off by less
 logger = logging.getLogger("recon")
@@ -169,7 +170,8 @@ def _refuse(arguments: Mapping[str, Any]) -> None:
         if value is not None and value is not False:
             raise ConfigError(
                 f"rasterization() does not do what `{name}` asks for.", hint=_HINTS.get(
-                    name, f"Leave `{name}` out, and undistort the images: `recon sfm` does."))
+                    name, f"Leave `{name}` out, and undistort the images: {name_command('sfm')} "
+                    "does."))
 
 
 _HINTS = {
@@ -193,7 +195,7 @@ def _check_choices(
                           hint="Give 'classic' or 'antialiased'.")
     if camera_model != "pinhole":
         raise ConfigError(f"camera_model is {camera_model!r}, but only pinhole is there.",
-                          hint="Undistort the images first: `recon sfm` does.")
+                          hint=f"Undistort the images first: {name_command('sfm')} does.")
     if rolling_shutter is not None and getattr(rolling_shutter, "name", "") != "GLOBAL":
         raise ConfigError("rolling_shutter is not GLOBAL, and only that is there.",
                           hint="Leave `rolling_shutter` out.")

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from recon_cli.render.camera_batch import (
+    BatchLayout,
     BatchOptions,
     Gaussians,
-    Layout,
     compensations,
     ellipses,
     radii,
@@ -44,14 +44,14 @@ class _Later:
 
 
 def view_meta(
-    layout: Layout, inputs: Gaussians, options: BatchOptions
+    layout: BatchLayout, inputs: Gaussians, options: BatchOptions
 ) -> tuple[LazyDict, Tensor]:
     """Returns all of meta but means2d, and the means2d, as arranged; see `rasterization`."""
     cameras = [
         TensorCamera(options.width, options.height, viewmat, K)
         for viewmat, K in zip(inputs.viewmats, inputs.Ks, strict=True)]
     seen = list(zip(cameras, layout.ids(), strict=True))
-    projected = [_project(inputs.means[ids], camera) for camera, ids in seen]
+    projected = [camera.project(inputs.means[ids]) for camera, ids in seen]
     means2d = layout.arrange(torch.cat([pixels for pixels, _ in projected]))
     enabled = torch.is_grad_enabled()
 
@@ -91,9 +91,3 @@ def view_meta(
     return meta, means2d
 
 
-def _project(means: Tensor, camera: TensorCamera) -> tuple[Tensor, Tensor]:
-    """Returns the pixels [M, 2] of centres [M, 3], and their depths [M]."""
-    local = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    depths = local[:, 2]
-    focal = torch.stack([camera.fx, camera.fy])
-    return local[:, :2] / depths[:, None] * focal + camera.intrinsics[:2, 2], depths

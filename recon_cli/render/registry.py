@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from recon_cli.errors import BackendError
+from recon_cli.errors import BackendError, name_command
 from recon_cli.render.contract import (
     TRANSMITTANCE_MIN,
     Renderer,
@@ -85,7 +85,7 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendError(
             "CUDA was asked for, but torch finds no CUDA device.",
-            hint="Leave --device out, or run `recon doctor`.")
+            hint=f"Leave --device out, or run {name_command('doctor')}.")
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     known = {status.name: status for status in available_backends()}
@@ -98,7 +98,7 @@ def resolve(backend: str, device: str) -> tuple[str, str]:
     if device not in status.devices or status.missing:
         reason = status.missing or f"it does not run on {device}"
         raise BackendError(
-            f"Backend {backend} cannot be used: {reason}.", hint="See `recon doctor`.")
+            f"Backend {backend} cannot be used: {reason}.", hint=f"See {name_command('doctor')}.")
     verdict = cuda_verdict() if backend == "triton" else None
     if verdict is not None and not verdict.passed:
         logger.warning(
@@ -120,7 +120,7 @@ def _see_one_gpu(device: str) -> str:
         raise BackendError(
             f"{device} was asked for, but torch finds {there or 'no CUDA device'}.",
             hint="Give --device one of those." if count else
-            "Leave --device out, or run `recon doctor`.")
+            f"Leave --device out, or run {name_command('doctor')}.")
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     names = visible.split(",") if visible else [str(number) for number in range(count)]
     os.environ |= {"CUDA_VISIBLE_DEVICES": names[index].strip(), _SEEN: device}
@@ -197,7 +197,7 @@ def renderer(backend: str) -> Renderer:
         from recon_cli.render.triton.backend import render as triton_render
 
         return triton_render
-    raise BackendError(f"Unknown backend {backend!r}.", hint="See `recon doctor`.")
+    raise BackendError(f"Unknown backend {backend!r}.", hint=f"See {name_command('doctor')}.")
 
 
 def render(

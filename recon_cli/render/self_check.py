@@ -29,7 +29,7 @@ from recon_cli.render.contract import Renderer, StepOptions, TargetImage
 from recon_cli.render.response import Response, ResponseTensors
 from recon_cli.render.torch.tiles import render as torch_render
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import TERMS, Splats
 
 logger = logging.getLogger("recon")
 
@@ -42,7 +42,7 @@ _ADAM = 1e-2  # of the learning rate
 _NOT_FINITE = 1e30  # stands for an error that is not finite: JSON has no number for it
 _RATE, _BETAS, _EPSILON = 1e-3, (0.9, 0.999), 1e-15
 _SSIM_WEIGHT = 0.2
-_DEGREE = 3
+_DEGREE = len(TERMS) - 1
 _REPEATS = 4  # of a step: CUDA graphs are recorded at the third time and replayed from then on
 _STATISTICS = "radii", "blend_sum", "means2d_grad", "loo"
 _AdamGroups = tuple[
@@ -67,7 +67,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, eq=False)
-class StepResult:
+class StepOutcome:
     """A training step: the loss, its gradients, and the parameters after one step of Adam."""
 
     loss: float
@@ -82,7 +82,7 @@ class BackendCandidate:
     name: str
     render: Renderer
     # by its own loss and optimizer; leaves the splats alone
-    train_step: Callable[[Splats, Camera, TargetImage, StepOptions], StepResult]
+    train_step: Callable[[Splats, Camera, TargetImage, StepOptions], StepOutcome]
 
 
 def numba_candidate() -> BackendCandidate:
@@ -93,11 +93,11 @@ def numba_candidate() -> BackendCandidate:
 
     def train_step(
         splats: Splats, camera: Camera, target: TargetImage, options: StepOptions
-    ) -> StepResult:
+    ) -> StepOutcome:
         gradients, moved = splats.map(torch.zeros_like), splats.map(torch.clone)
         loss = PhotometricStep()(splats, gradients, camera, target, options)
         adam(*_adam_groups(moved, gradients), count=1, betas=_BETAS, epsilon=_EPSILON)
-        return StepResult(loss, gradients, moved)
+        return StepOutcome(loss, gradients, moved)
 
     return BackendCandidate("numba", render, train_step)
 
@@ -110,7 +110,7 @@ def triton_candidate() -> BackendCandidate:
 
     def train_step(
         splats: Splats, camera: Camera, target: TargetImage, options: StepOptions
-    ) -> StepResult:
+    ) -> StepOutcome:
         gradients, moved = splats.map(torch.zeros_like), splats.map(torch.clone)
         step, steps = PhotometricStep(splats.means.device), 0
         while steps < _REPEATS:
@@ -119,7 +119,7 @@ def triton_candidate() -> BackendCandidate:
             steps += report.stopped is None  # else there is room for it now
         adam(*_adam_groups(moved, gradients), counted=step.counted, betas=_BETAS,
              taken=torch.zeros(1, dtype=torch.int64, device=splats.means.device), epsilon=_EPSILON)
-        return StepResult(report.loss, gradients, moved)
+        return StepOutcome(report.loss, gradients, moved)
 
     return BackendCandidate("triton", render, train_step)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from recon_cli.render.contract import DILATION, EllipseGradients
 from recon_cli.render.torch.blocks import gradients_of, whitening_factors
 from recon_cli.render.torch.projection import colors_from_sh, covariances, project_rows
+from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
 
@@ -50,6 +51,22 @@ class TensorCamera:
         """The optical centre in world coordinates, [3]."""
         center: Tensor = torch.linalg.inv(self.viewmat)[:3, 3]
         return center
+
+    @staticmethod
+    def from_camera(camera: Camera, like: Tensor) -> TensorCamera:
+        """Returns a camera on the device and in the precision of a tensor."""
+        return TensorCamera(camera.width, camera.height, torch.from_numpy(camera.viewmat).to(like),
+                            torch.from_numpy(camera.K).to(like))
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the pixels [P, 2] and depths [P] of points [P, 3] in the world; differentiable.
+
+        Unlike `Camera.project` it marks nothing: who calls it looks at the depths.
+        """
+        local = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        depths = local[:, 2]
+        focal = torch.stack([self.fx, self.fy])
+        return local[:, :2] / depths[:, None] * focal + self.intrinsics[:2, 2], depths
 
 
 def view_gradient(

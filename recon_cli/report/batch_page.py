@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-import cv2
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
-
 from recon_cli.evaluation.scores import Table, or_dash
-from recon_cli.io.images import fit_image, read_png
 from recon_cli.pipeline.batch import CaptureResult
 from recon_cli.progress import format_duration
+from recon_cli.report.build import render_template
+from recon_cli.report.gallery import read_picture
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 
 FILE = "batch.html"
-_HERE = Path(__file__).parent
-_PICTURE_SIZE = 240  # longest side, pixels
-_QUALITY = 80  # of the JPEG
 _HEADINGS = ("capture", "exit code", "frames", "registered", "PSNR, dB", "SSIM", "Gaussians", "MB",
              "time")
 
@@ -50,12 +43,9 @@ def write_batch_page(results: Sequence[CaptureResult], out: Path) -> Path:
     Raises:
         WorkspaceError: it cannot be written.
     """
-    environment = Environment(
-        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True)
-    page = environment.get_template("batch.html.j2").render(
-        name=out.absolute().name, date=datetime.now().strftime("%Y-%m-%d %H:%M"),
-        style=Markup((_HERE / "style.css").read_text(encoding="utf-8")), headings=_HEADINGS,
+    page = render_template(
+        "batch.html.j2", name=out.absolute().name,
+        date=datetime.now().strftime("%Y-%m-%d %H:%M"), headings=_HEADINGS,
         done=sum(result.succeeded for result in results),
         rows=[(result, _cells(result), quote(result.capture), _picture(out / result.capture))
               for result in results])
@@ -68,9 +58,4 @@ def write_batch_page(results: Sequence[CaptureResult], out: Path) -> Path:
 def _picture(workspace: Path) -> str:
     """Returns a held-out view as the scene shows it, as a data URI; empty where there is none."""
     renders = sorted(workspace.glob("evaluate/renders/*/*.png"))
-    if not renders:
-        return ""
-    small = fit_image(read_png(renders[0]), _PICTURE_SIZE)
-    _, data = cv2.imencode(
-        ".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+    return read_picture(renders[0]) if renders else ""

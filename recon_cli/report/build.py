@@ -180,11 +180,15 @@ def _render_page(
     script = (_HERE / "script.js").read_text(encoding="utf-8")
     # the hash in the content policy lets the browser run this script and no other
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    page = environment.get_template("report.html.j2").render(
-        **values, gallery=gallery, data=data,
-        style=Markup((_HERE / "style.css").read_text(encoding="utf-8")),
-        script=Markup(script), script_hash=digest)
+    page = render_template("report.html.j2", environment, **values, gallery=gallery, data=data,
+                           script=Markup(script), script_hash=digest)
     return page.encode(errors="backslashreplace")  # file names need not be UTF-8
+
+
+def render_template(name: str, environment: Environment | None = None, /, **values: Any) -> str:
+    """Returns a page of this folder's templates, with the style of them all."""
+    style = Markup((_HERE / "style.css").read_text(encoding="utf-8"))
+    return (environment or _environment()).get_template(name).render(style=style, **values)
 
 
 def _script_data(view: GalleryView, name: str) -> dict[str, Any]:

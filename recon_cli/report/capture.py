@@ -18,11 +18,12 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from recon_cli.config.stages import TrainConfig
-from recon_cli.errors import FormatError, list_names
+from recon_cli.errors import list_names
 from recon_cli.io.colmap import read_scene
-from recon_cli.io.images import fit_image, read_png
-from recon_cli.report.chart import draw_mark, legend_item
-from recon_cli.report.gallery import data_uri, encode_sheet
+from recon_cli.io.images import read_png
+from recon_cli.io.svg import PlanLayout, element, label
+from recon_cli.report.chart import TICK_STEPS, draw_legend, draw_mark
+from recon_cli.report.gallery import encode_sheet, note_damage, read_picture
 from recon_cli.report.stage_status import StageReports
 from recon_cli.report.trust_section import read_regions
 from recon_cli.scene.gravity import find_gravity, mean_up
@@ -32,7 +33,7 @@ from recon_cli.workspace.records import FOLDER, Frame, describe_stretches, read_
 from recon_cli.workspace.summaries import PlaceSummary
 
 _SHEETS = 4  # contact sheets on the page; a capture may have many sources
-_THUMBS, _THUMB_SIDE, _THUMB_QUALITY = 24, 220, 72
+_THUMBS = 24  # without contact sheets
 _STRETCHES = 30  # of frames that are left out, by name
 _STRIP_HEIGHT = 34  # pixels of the strip of frames
 WIDTH = 640  # pixels of plan and strip; the page scales them
@@ -43,7 +44,6 @@ _PERCENTILES = (2.0, 98.0)  # of the points that fit in; outliers may lie far aw
 _GRAY = 128  # of the points: visible on white and on black
 _MANY_CAMERAS = 150  # from which on marks are smaller
 _REGION_COLOR, _REGION_SIZE = 6, 9.0  # of the marks of poorly seen regions, pixels
-_BAR = 0.25  # of the width that the scale bar takes at most
 # (color, mark) of the page's charts; green and blue are those of the contact sheet
 PARTS = {"training": (2, "circle"), "validation": (5, "square"), "held out": (0, "diamond")}
 MISSING = {"other part": (4, "triangle"), "left out": (1, "plus"), "lost": (3, "cross")}
@@ -72,28 +72,21 @@ def read_capture(stages: StageReports) -> CaptureSection:
     frames: tuple[Frame, ...] = ()
     sheets, more, thumbs = [], 0, []
     overlays: list[Markup] = []
-    try:
+    scene = None
+    with note_damage(damaged, "The frames are not shown"):
         frames = read_frame_list(ingest.folder).frames
         paths = sorted(ingest.folder.glob("*contact.png"))
         sheets = [encode_sheet(read_png(path)) for path in paths[:_SHEETS]]
         more = len(paths) - len(sheets)
         some = () if sheets else frames[:: max(1, -(-len(frames) // _THUMBS))]
-        thumbs = [(frame.name, data_uri(fit_image(
-            read_png(ingest.folder / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY))
-            for frame in some]
-    except (FormatError, OSError) as error:
-        damaged.append(f"The frames are not shown: {error}")
-    try:
-        overlays = [data_uri(fit_image(read_png(path), WIDTH), _THUMB_QUALITY)
+        thumbs = [(frame.name, read_picture(ingest.folder / FOLDER / frame.name))
+                  for frame in some]
+    with note_damage(damaged, "Masked areas are not shown"):
+        overlays = [read_picture(path)
                     for path in sorted(ingest.folder.glob("*overlay.png"))[:_SHEETS]]
-    except (FormatError, OSError) as error:
-        damaged.append(f"Masked areas are not shown: {error}")
-    scene = None
     if stages["place"].there and frames:
-        try:
+        with note_damage(damaged, "The plan is not shown"):
             scene = _read_scene(stages, frames)
-        except (FormatError, OSError) as error:
-            damaged.append(f"The plan is not shown: {error}")
     sfm = stages["place"].read_summary(PlaceSummary)
     left_out = sfm.left_out if sfm else ()
     plan, notes = _draw_plan(scene, sfm, read_regions(stages)) if scene else (None, ())
@@ -152,16 +145,14 @@ def _draw_strip(frames: Sequence[Frame], parts: Sequence[str]) -> Markup:
     for i, (frame, part) in enumerate(zip(frames, parts, strict=True)):
         color = {**PARTS, **MISSING}[part][0]
         time = "" if frame.time_seconds is None else f", {frame.time_seconds:g} s"
-        bars.append(Markup(
-            '<rect class="part c{}{}" x="{:.2f}" y="{}" width="{:.2f}" height="{}">'
-            "<title>{}</title></rect>").format(
-                color, " hollow" if part in MISSING else "", i * step,
-                _STRIP_HEIGHT - heights.get(part, 28), max(0.6, 0.8 * step), heights.get(part, 28),
-                f"{frame.name} ({part}{time})"))
-    return Markup(
-        '<svg class="strip" viewBox="0 0 {} {}" preserveAspectRatio="none" role="img" '
-        'aria-label="The frames in order">{}</svg>').format(
-            WIDTH, _STRIP_HEIGHT, Markup("").join(bars))
+        height = heights.get(part, 28)
+        bars.append(element(
+            "rect", element("title", f"{frame.name} ({part}{time})"),
+            class_=f"part c{color}{' hollow' if part in MISSING else ''}", x=f"{i * step:.2f}",
+            y=_STRIP_HEIGHT - height, width=f"{max(0.6, 0.8 * step):.2f}", height=height))
+    return element("svg", Markup("").join(bars), class_="strip", role="img",
+                   viewBox=f"0 0 {WIDTH} {_STRIP_HEIGHT}", preserveAspectRatio="none",
+                   aria_label="The frames in order")
 
 
 def _draw_legend(parts: Sequence[str]) -> Markup:
@@ -171,9 +162,9 @@ def _draw_legend(parts: Sequence[str]) -> Markup:
              "other part": "in another part of the capture",
              "left out": "left out, with a camera that is not trusted"}
     marks = {**PARTS, **MISSING}
-    return Markup('<ul class="legend">{}</ul>').format(Markup("").join(
-        legend_item(f"{counts[part]:,} {texts[part]}", draw_mark(shape, 13, 7, 4.5, color))
-        for part, (color, shape) in marks.items() if part in counts))
+    return draw_legend(
+        (f"{counts[part]:,} {texts[part]}", draw_mark(shape, 13, 7, 4.5, color))
+        for part, (color, shape) in marks.items() if part in counts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,11 +206,15 @@ def draw_plan(
              for part, views in parts.items() for view in views]
     marks += [_draw_region(number, each, axes, layout)
               for number, each in enumerate(regions, 1)]
-    bar = _draw_scale_bar(layout) if metres else Markup("")
-    return Markup(
-        '<svg class="plan" viewBox="0 0 {} {}" role="img" '
-        'aria-label="Cameras and points from above">{}{}{}</svg>').format(
-            WIDTH, layout.height, _draw_density(points, layout), Markup("").join(marks), bar)
+    if metres:
+        most = WIDTH / layout.scale / 4
+        power = 10.0 ** math.floor(math.log10(most))
+        length = max(step * power for step in TICK_STEPS if step * power <= most)
+        marks.append(layout.scale_bar(
+            (WIDTH - _MARGIN, layout.height - 10), length, 6, class_="axis scale"))
+    return element(
+        "svg", _draw_density(points, layout) + Markup("").join(marks), class_="plan", role="img",
+        viewBox=f"0 0 {WIDTH} {layout.height}", aria_label="Cameras and points from above")
 
 
 def by_part(scene: Scene) -> Mapping[str, Sequence[View]]:
@@ -228,21 +223,7 @@ def by_part(scene: Scene) -> Mapping[str, Sequence[View]]:
     return dict(zip(PARTS, parts, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
-class _PlanLayout:
-    """Maps plan coordinates to the drawing."""
-
-    scale: float  # pixels a unit
-    corner: NDArray[np.float64]  # [2] plan coordinates of the lower left corner
-    height: int  # of the drawing in pixels
-
-    def at(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns pixels from the left and from the top, [..., 2], of places [..., 2]."""
-        pixels = (places - self.corner) * self.scale
-        return np.stack([pixels[..., 0], self.height - pixels[..., 1]], axis=-1)
-
-
-def _fit_layout(points: NDArray[np.float64], places: NDArray[np.float64]) -> _PlanLayout:
+def _fit_layout(points: NDArray[np.float64], places: NDArray[np.float64]) -> PlanLayout:
     """Returns the largest centred layout of every camera [C, 2] and nearly all points [N, 2]."""
     most = np.percentile(points, _PERCENTILES, axis=0) if len(points) else places
     low, high = np.minimum(most.min(0), places.min(0)), np.maximum(most.max(0), places.max(0))
@@ -252,10 +233,10 @@ def _fit_layout(points: NDArray[np.float64], places: NDArray[np.float64]) -> _Pl
     scale = float(((np.array([WIDTH, _MAX_HEIGHT]) - 2 * _MARGIN) / size).min())
     height = round(float(size[1]) * scale) + 2 * _MARGIN
     middle = np.array([WIDTH, height]) / 2
-    return _PlanLayout(scale, (low + high) / 2 - middle / scale, height)
+    return PlanLayout(scale, (low + high) / 2 - middle / scale, height)
 
 
-def _draw_density(points: NDArray[np.float64], layout: _PlanLayout) -> Markup:
+def _draw_density(points: NDArray[np.float64], layout: PlanLayout) -> Markup:
     """Returns the points as an image whose opacity grows with the logarithm of their number."""
     rows, columns = math.ceil(layout.height / _CELL), math.ceil(WIDTH / _CELL)
     pixels = layout.at(points)
@@ -267,43 +248,27 @@ def _draw_density(points: NDArray[np.float64], layout: _PlanLayout) -> Markup:
     picture = np.full((rows, columns, 4), _GRAY, np.uint8)
     picture[..., 3] = np.rint(230 * opacity)
     _, data = cv2.imencode(".png", picture)
-    return Markup('<image width="{}" height="{}" href="data:image/png;base64,{}"/>').format(
-        columns * _CELL, rows * _CELL, base64.b64encode(data.tobytes()).decode())
+    return element("image", width=columns * _CELL, height=rows * _CELL,
+                   href=f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}")
 
 
-def _draw_camera(view: View, axes: PlanAxes, layout: _PlanLayout, part: str, size: float) -> Markup:
+def _draw_camera(view: View, axes: PlanAxes, layout: PlanLayout, part: str, size: float) -> Markup:
     color, shape = PARTS[part]
     camera = view.camera
     x, y = map(float, layout.at(axes.axes @ camera.center))
     ahead = axes.axes @ camera.viewmat[2, :3]  # z of the camera, projected onto the plan
-    line = Markup('<path class="line c{}" d="M{},{}l{},{}"/>').format(
-        color, round(x, 1), round(y, 1),
-        round(4 * size * float(ahead[0]), 1), round(-4 * size * float(ahead[1]), 1))
+    across, down = 4 * size * ahead * (1, -1)
+    line = element("path", class_=f"line c{color}", d=f"M{x:.1f},{y:.1f}l{across:.1f},{down:.1f}")
     radius = size * (1.25 if part == "held out" else 1.0)
     return line + draw_mark(shape, x, y, radius, color, f"{view.name} ({part})")
 
 
 def _draw_region(
-    number: int, each: PoorlySeenRegion, axes: PlanAxes, layout: _PlanLayout
+    number: int, each: PoorlySeenRegion, axes: PlanAxes, layout: PlanLayout
 ) -> Markup:
     x, y = map(float, layout.at(axes.axes @ np.array(each.position)))
-    return Markup(
-        '<circle class="line c{}" cx="{}" cy="{}" r="{}"/>{}'
-        '<text class="next" x="{}" y="{}" text-anchor="middle">{}</text>').format(
-            _REGION_COLOR, round(x, 1), round(y, 1), round(each.size / 2 * layout.scale, 1),
-            draw_mark("circle", x, y, _REGION_SIZE, _REGION_COLOR, f"poorly seen: {each.cause}"),
-            round(x, 1), round(y + 4, 1), number)
-
-
-def _draw_scale_bar(layout: _PlanLayout) -> Markup:
-    """Returns a bar of 1, 2 or 5 times a power of ten of metres."""
-    most = _BAR * WIDTH / layout.scale
-    power = 10.0 ** math.floor(math.log10(most))
-    metres = max(factor * power for factor in (1, 2, 5) if factor * power <= most)
-    length, y = metres * layout.scale, layout.height - 10
-    x = WIDTH - _MARGIN - length
-    return Markup(
-        '<path class="axis scale" d="M{},{}v6h{}v-6"/>'
-        '<text class="label" x="{}" y="{}" text-anchor="middle">{} m</text>').format(
-            round(x, 1), y - 6, round(length, 1), round(x + length / 2, 1), y - 9,
-            f"{metres:g}")
+    return (
+        element("circle", class_=f"line c{_REGION_COLOR}", cx=x, cy=y,
+                r=each.size / 2 * layout.scale)
+        + draw_mark("circle", x, y, _REGION_SIZE, _REGION_COLOR, f"poorly seen: {each.cause}")
+        + label(x, y + 4, number, class_="next"))

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup
+
+from recon_cli.io.svg import element, join_points, label
 
 WIDTH, HEIGHT = 480, 300  # of the drawing; the page scales it
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 12, 44
 _TICK_CHARS = 62  # pixels that a label of the x axis takes
 MARKS = ("circle", "square", "diamond", "triangle", "cross", "ring", "plus")
 
-_STEPS = (1.0, 2.0, 5.0, 10.0)  # a tick lies at a multiple of one of these and a power of ten
+TICK_STEPS = (1.0, 2.0, 5.0, 10.0)  # a tick lies at a multiple of one of these and a power of ten
 _NEAR_ZERO = 0.2  # of the highest value
 _LEAST_DECADES = 1.0  # below, a logarithmic axis has too few round numbers and takes linear ticks
 
@@ -82,13 +84,13 @@ def draw_chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> Markup
 
     parts = _draw_axes(x, y, across, up)
     parts += [
-        _line_path(line, "L".join(f"{x:.1f},{y:.1f}" for x, y in map(place, line.points)))
+        _line_path(line, join_points(map(place, line.points)))
         for line in lines if line.line]
     parts += [mark for line in lines if line.mark for mark in _draw_marks(line, place, x, y)]
     return Markup(
-        '<figure class="chart"><figcaption>{}</figcaption>'
-        '<svg viewBox="0 0 {} {}" role="img" aria-label="{}">{}</svg>{}</figure>').format(
-            title, WIDTH, HEIGHT, title, Markup("").join(parts), _draw_legend(lines))
+        '<figure class="chart"><figcaption>{}</figcaption>{}{}</figure>').format(
+            title, element("svg", Markup("").join(parts), viewBox=f"0 0 {WIDTH} {HEIGHT}",
+                           role="img", aria_label=title), _draw_legend(lines))
 
 
 def draw_mark(shape: str, x: float, y: float, r: float, color: int, title: str = "") -> Markup:
@@ -104,21 +106,22 @@ def draw_mark(shape: str, x: float, y: float, r: float, color: int, title: str =
         "plus": f"M{x - r:.1f},{y:.1f}h{2 * r}m{-r},{-r}v{2 * r}",
     }
     hollow = " hollow" if shape in ("ring", "cross", "plus") else ""
-    return Markup('<path class="mark c{}{}" d="{}">{}</path>').format(
-        color, hollow, paths[shape], Markup("<title>{}</title>").format(title) if title else "")
+    return element("path", element("title", title) if title else "",
+                   class_=f"mark c{color}{hollow}", d=paths[shape])
 
 
-def legend_item(label: str, drawing: Markup) -> Markup:
-    """Returns an entry of a legend: a drawing and its meaning."""
-    return Markup('<li><svg viewBox="0 0 26 14" aria-hidden="true">{}</svg>{}</li>').format(
-        drawing, label)
+def draw_legend(entries: Iterable[tuple[str, Markup]]) -> Markup:
+    """Returns the legend of drawings: each a meaning and a sample."""
+    return element("ul", Markup("").join(
+        element("li", element("svg", sample, viewBox="0 0 26 14", aria_hidden="true") + meaning)
+        for meaning, sample in entries), class_="legend")
 
 
 def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
     """Returns round numbers from `low` to `high`, at least two and at most `most` (3 or more)."""
     rough = (high - low) / (most - 1)
     power = 10.0 ** math.floor(math.log10(rough))
-    step = next(factor * power for factor in _STEPS if factor * power >= rough * (1 - 1e-9))
+    step = next(factor * power for factor in TICK_STEPS if factor * power >= rough * (1 - 1e-9))
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [number * step for number in range(first, last + 1)]
 
@@ -164,33 +167,26 @@ def _fit_scale(values: Sequence[float], axis: Axis, length: float) -> Scale:
 
 def _draw_axes(x: Axis, y: Axis, across: Scale, up: Scale) -> list[Markup]:
     floor, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
-    grid_line = Markup('<line class="grid" x1="{}" x2="{}" y1="{}" y2="{}"/>')
     parts = []
     for tick in up.ticks(7):
-        at = round(floor - up(tick), 1)
-        parts += [grid_line.format(_LEFT, right, at, at),
-                  _draw_text(_LEFT - 7, at + 4, tick_label(tick), "end")]
+        at = floor - up(tick)
+        parts += [element("line", class_="grid", x1=_LEFT, x2=right, y1=at, y2=at),
+                  label(_LEFT - 7, at + 4, tick_label(tick), class_="label", text_anchor="end")]
     for tick in across.ticks(round(across.length / _TICK_CHARS)):
-        at = round(_LEFT + across(tick), 1)
-        parts += [grid_line.format(at, at, _TOP, floor),
-                  _draw_text(at, floor + 17, tick_label(tick), "middle")]
-    middle = round((_TOP + floor) / 2, 1)
+        at = _LEFT + across(tick)
+        parts += [element("line", class_="grid", x1=at, x2=at, y1=_TOP, y2=floor),
+                  label(at, floor + 17, tick_label(tick), class_="label")]
+    middle = (_TOP + floor) / 2
     return [
         *parts,
-        Markup('<path class="axis" d="M{},{}V{}H{}"/>').format(_LEFT, _TOP, floor, right),
-        _draw_text((_LEFT + right) / 2, HEIGHT - 7, x.label, "middle"),
-        Markup('<text class="label" x="13" y="{}" text-anchor="middle" '
-               'transform="rotate(-90 13 {})">{}</text>').format(middle, middle, y.label)]
-
-
-def _draw_text(x: float, y: float, text: str, anchor: str) -> Markup:
-    return Markup('<text class="label" x="{}" y="{}" text-anchor="{}">{}</text>').format(
-        round(x, 1), round(y, 1), anchor, text)
+        element("path", class_="axis", d=f"M{_LEFT},{_TOP}V{floor}H{right}"),
+        label((_LEFT + right) / 2, HEIGHT - 7, x.label, class_="label"),
+        label(13, middle, y.label, class_="label", transform=f"rotate(-90 13 {middle})")]
 
 
 def _line_path(series: Series, path: str) -> Markup:
-    return Markup('<path class="line c{}{}" d="M{}"/>').format(
-        series.color, " dashed" if series.dashed else "", path)
+    return element("path", class_=f"line c{series.color}{' dashed' if series.dashed else ''}",
+                   d=f"M{path}")
 
 
 def _draw_marks(
@@ -209,5 +205,5 @@ def _draw_legend(lines: Sequence[Series]) -> Markup:
         sample = _line_path(line, "1,7H25") if line.line else Markup("")
         if line.mark:
             sample += draw_mark(line.mark, 13, 7, 5 if line.big else 3.5, line.color)
-        items.append(legend_item(line.label, sample))
-    return Markup('<ul class="legend">{}</ul>').format(Markup("").join(items))
+        items.append((line.label, sample))
+    return draw_legend(items)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from recon_cli.progress import NullProgress, Progress
 
 MAX_FILE_BYTES = 15_000_000
 GAIN = 4  # of a difference, as in evaluate/difference
-MOST_ERROR = 64  # mean error in 1/255 from which on colours no longer change: 255 / GAIN
+MOST_ERROR = 256 // GAIN  # mean error in 1/255 from which on colours no longer change
 _HIDDEN = (96, 96, 96)  # of masked pixels in a difference: no colour of the map
 
 
@@ -39,6 +40,7 @@ ENCODINGS = (
     Encoding(1600, 86), Encoding(1200, 84), Encoding(900, 82), Encoding(680, 80),
     Encoding(560, 78), Encoding(480, 75), Encoding(420, 73), Encoding(360, 70), Encoding(300, 66),
     Encoding(240, 62))
+THUMB, MOST_THUMBS = Encoding(480, 72), 8  # beside a text, and how many a section shows
 _SHEET = Encoding(2000, 80)  # as ingest draws it, so that its captions can be read
 _SHEET_BYTES = 900_000
 _SAMPLE = 3  # views whose size is taken for that of all
@@ -145,11 +147,8 @@ def _iterate(
 ) -> Iterator[tuple[_ViewScores, _ViewPixels]]:
     """Yields the readable views; appends why others cannot be read to `damaged`."""
     for scores in order:
-        try:
+        with note_damage([] if damaged is None else damaged, f"{_name(scores)} is not shown"):
             yield scores, _read_pixels(folder, scores)
-        except (FormatError, OSError) as error:
-            if damaged is not None:
-                damaged.append(f"{_name(scores)} is not shown: {error}")
 
 
 def _read_pixels(folder: Path, scores: _ViewScores) -> _ViewPixels:
@@ -190,6 +189,20 @@ def _encode_view(
         {key: data_uri(draw_difference(pixels.truth, image, pixels.hidden, longest), quality)
          for key, image in pixels.renders.items()},
         scores, pixels.hidden is not None)
+
+
+@contextmanager
+def note_damage(damaged: list[str], text: str) -> Iterator[None]:
+    """Appends `text` with the reason to `damaged` if a file cannot be read."""
+    try:
+        yield
+    except (FormatError, OSError) as error:
+        damaged.append(f"{text}: {error}")
+
+
+def read_picture(path: Path, encoding: Encoding = THUMB) -> Markup:
+    """Returns a PNG file as a data URI; FormatError or OSError if it cannot be read."""
+    return data_uri(fit_image(read_png(path), encoding.longest), encoding.quality)
 
 
 def data_uri(image: NDArray[np.uint8], quality: int) -> Markup:

@@ -12,8 +12,7 @@ from markupsafe import Markup
 
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.scores import Metrics
-from recon_cli.io.images import fit_image, read_png
-from recon_cli.report.gallery import data_uri
+from recon_cli.report.gallery import ENCODINGS, read_picture
 from recon_cli.report.stage_status import StageReport, StageReports
 from recon_cli.report.trust_section import read_record
 from recon_cli.splats.html import find_title
@@ -22,8 +21,6 @@ from recon_cli.trust.scene_trust import TrustRecord
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.records import FOLDER, Frame, read_frame_list
 from recon_cli.workspace.summaries import ExportedFile, ExportSummary, PlaceSummary
-
-_SIDE, _QUALITY = 1280, 86
 
 
 @dataclass(frozen=True)
@@ -90,19 +87,19 @@ def _find_picture(
         folder = stages["evaluate"].folder / "renders" / model
         better = [folder / f"{Path(view.name).stem}.png" for view in views[:-(-len(views) // 2)]]
         for path in sorted(filter(Path.is_file, better), key=lambda path: -path.stat().st_size):
-            if (picture := _read_picture(path)) is not None:
+            if (picture := _try_picture(path)) is not None:
                 return picture, (f"Rendered by the scene where {name_view(path.name, frames)} was "
                                  "taken, a view that it was not trained on.")
     if frames:
         frame = frames[len(frames) // 2].name
-        picture = _read_picture(stages["ingest"].folder / FOLDER / frame)
+        picture = _try_picture(stages["ingest"].folder / FOLDER / frame)
         return picture, f"{frame}, a frame of the capture." if picture else ""
     return None, ""
 
 
-def _read_picture(path: Path) -> Markup | None:
+def _try_picture(path: Path) -> Markup | None:
     try:
-        return data_uri(fit_image(read_png(path), _SIDE), _QUALITY)
+        return read_picture(path, ENCODINGS[1])
     except (FormatError, OSError):
         return None
 

@@ -14,11 +14,10 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.io.colmap import read_images, read_points
-from recon_cli.io.images import fit_image, read_png
 from recon_cli.report.capture import draw_plan, find_axes
-from recon_cli.report.gallery import data_uri
+from recon_cli.report.gallery import note_damage, read_picture
 from recon_cli.report.stage_status import StageReports
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
@@ -27,8 +26,7 @@ from recon_cli.workspace.summaries import PartSummary, PlaceSummary
 
 _MOST = 12  # parts on the page
 MARGIN = 2.0  # seconds to film before and after a moment, so that the new film ties to both parts
-_THUMB_SIDE, _THUMB_QUALITY = 360, 75
-_HINT = "Run `recon sfm --again`."
+_HINT = Hint("sfm", again=True)
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ def read_parts(stages: StageReports) -> Parts:
     cameras = stages["place"].read_summary(PlaceSummary) if stages["place"].there else None
     if cameras is None or len(cameras.parts) < 2:
         return Parts()
-    ingest, damaged = stages["ingest"].folder, []
+    ingest, damaged = stages["ingest"].folder, list[str]()
     try:
         known = read_frame_list(ingest)
         frames = known.frames
@@ -82,13 +80,11 @@ def read_parts(stages: StageReports) -> Parts:
     views = []
     for number, part in list(enumerate(cameras.parts, 1))[:_MOST]:
         placed, plan = number == cameras.part, None
-        try:
+        with note_damage(damaged, f"Part {number} is not drawn"):
             folder = (stages["place"].folder / "sparse" if placed
                       else stages["sfm"].folder / f"parts/{number}")
             up_found = placed and cameras.world.evidence.up_found
             plan = _draw_part(folder, frames, up_found=up_found)
-        except (FormatError, OSError) as error:
-            damaged.append(f"Part {number} is not drawn: {error}")
         views.append(PartView(
             number, placed,
             f"{len(part.names):,} of {cameras.frames:,} frames, {part.points:,} points",
@@ -150,9 +146,7 @@ def find_moments(frames: Sequence[Frame], parts: Sequence[PartSummary]) -> list[
 
 
 def _read_moment(ingest: Path, gap: PartGap, *, panoramas: bool) -> Moment:
-    pictures = [
-        data_uri(fit_image(read_png(ingest / FOLDER / frame.name), _THUMB_SIDE), _THUMB_QUALITY)
-        for frame in (gap.before, gap.after)]
+    pictures = [read_picture(ingest / FOLDER / frame.name) for frame in (gap.before, gap.after)]
     times = _format_time(gap.before), _format_time(gap.after)
     return Moment(gap.numbers, (gap.before.name, gap.after.name), times,
                   (pictures[0], pictures[1]), gap.lost,

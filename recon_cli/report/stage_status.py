@@ -105,7 +105,8 @@ def _command(inspection: WorkspaceCheck, check: StageCheck, root: Path) -> str:
     latest = check.partial_run or check.manifest
     inputs = [source.path for source in latest.key.sources] if latest else []
     return " ".join([
-        plan.command(inspection, check), *map(shlex.quote, inputs), "-w", shlex.quote(str(root))])
+        "recon", plan.command(inspection, check), *map(shlex.quote, inputs),
+        "-w", shlex.quote(str(root))])
 
 
 @dataclass(frozen=True)

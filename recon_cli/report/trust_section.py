@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,17 +10,14 @@ from markupsafe import Markup
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.scores import Table
-from recon_cli.io.images import fit_image, read_png
 from recon_cli.report.chart import Axis, Series, draw_chart
-from recon_cli.report.gallery import data_uri
+from recon_cli.report.gallery import MOST_THUMBS, note_damage, read_picture
 from recon_cli.report.records import MODELS
 from recon_cli.report.stage_status import StageReports
 from recon_cli.trust.heat_map import INVENTED, TRUSTED, legend_stops
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.scene_trust import FOLDER, ModelTrust, TrustRecord
 from recon_cli.trust.surface import MIN_SPAN_DEG, MIN_VIEWS
-
-_PICTURES, _SIDE, _QUALITY = 6, 480, 72
 
 
 @dataclass(frozen=True)
@@ -117,15 +113,8 @@ def _read_pictures(evaluate: Path, model: str) -> tuple[tuple[str, Markup, Marku
     """Returns some held-out views with their heat maps, evenly spread; none if files are gone."""
     paths = sorted((evaluate / FOLDER / model).glob("*.png"))
     pictures = []
-    for path in _spread(paths):
-        try:
-            render, heat = (data_uri(fit_image(read_png(file), _SIDE), _QUALITY) for file in (
-                evaluate / "renders" / model / path.name, path))
-        except (FormatError, OSError):
-            continue
-        pictures.append((path.stem, render, heat))
+    for path in paths[:: max(1, -(-len(paths) // MOST_THUMBS))]:
+        with note_damage([], path.stem):
+            render = read_picture(evaluate / "renders" / model / path.name)
+            pictures.append((path.stem, render, read_picture(path)))
     return tuple(pictures)
-
-
-def _spread(paths: Sequence[Path]) -> Sequence[Path]:
-    return paths[:: max(1, -(-len(paths) // _PICTURES))]

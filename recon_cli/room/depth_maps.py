@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.render.surface_depth import render_surface
+from recon_cli.room.kernels import LEAST_COSINE
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import camera_row
+from recon_cli.stereo.depths import TOLERANCE, camera_row
 from recon_cli.stereo.kernels import compare
 
 # Chosen on the room "living" and checked on "office", tests/bench/bench_mesh.py:
 NEAR = 0.02  # of the median depth; nothing nearer to a camera is a surface
-_LEAST_COSINE = 0.1  # between ray and normal
-_TOLERANCE = 0.015  # of a depth, within which two maps show the same surface
 _NEIGHBOURS = 12  # views that each is compared with
 _TURN = 2.0  # median depths that a difference of 1 in the cosine of two directions counts as
 _LEAST_TURN = 0.5  # cosine between the directions of neighbours
@@ -54,7 +53,7 @@ def render_depth_maps(
         surface = render_surface(splats, view.camera, backend=backend)
         depth = surface.depth.cpu().numpy().astype(np.float32)
         cosine = surface.cosine.cpu().numpy()
-        used = (depth > 0) & (cosine > _LEAST_COSINE)
+        used = (depth > 0) & (cosine > LEAST_COSINE)
         if view.mask is not None:
             used &= view.mask
         depths.append(np.where(used, depth, 0).astype(np.float32))
@@ -89,7 +88,7 @@ def weigh_by_agreement(maps: DepthMaps) -> None:
     neighbours = find_neighbours(maps.cameras, maps.median)
     for own, (gain, others) in enumerate(zip(maps.gains, neighbours, strict=True)):
         agree, through = np.zeros((2, gain.size), np.int32)
-        pool.run(compare, flat, starts, table, own, others, _TOLERANCE, maps.near, agree, through,
+        pool.run(compare, flat, starts, table, own, others, TOLERANCE, maps.near, agree, through,
                  scratch=False)
         share = agree / np.maximum(agree + through, 1)
         gain *= (share * share).reshape(gain.shape).astype(np.float32)

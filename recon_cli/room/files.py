@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import WorkspaceError
+from recon_cli.errors import WorkspaceError, name_command
 from recon_cli.io.meshes import Mesh, read_mesh, write_mesh
 from recon_cli.room.measures import RoomFrame, measure_room
 from recon_cli.room.mesh import MeshResult
 from recon_cli.room.plan_svg import describe, draw_plan
 from recon_cli.splats.glb import nearest_axes
+from recon_cli.splats.ply import ROUNDING
 from recon_cli.workspace.atomic import write_bytes, write_json
 
 MEASURES = "measures.json"
-_ROUNDING = 1e-6  # of the largest coordinate: float32, and eight digits of text
 
 logger = logging.getLogger("recon")
 
@@ -55,12 +55,12 @@ def _verify_mesh(
     vertices = mesh.vertices if axes is None else mesh.vertices @ axes.T
     size = float(np.abs(vertices).max())
     same = (np.array_equal(back.faces, mesh.faces) and back.vertices.shape == vertices.shape
-            and np.abs(back.vertices - vertices).max() <= _ROUNDING * size
+            and np.abs(back.vertices - vertices).max() <= ROUNDING * size
             and _same_look(back, mesh, tint and path.suffix == ".ply"))
     if not same:
         raise WorkspaceError(
             f"{path} does not read back as the mesh that was written.",
-            hint="Check the disk, then run `recon export --again`.")
+            hint=f"Check the disk, then run {name_command('export --again')}.")
 
 
 def _same_look(back: Mesh, mesh: Mesh, tinted: bool) -> bool:
@@ -76,7 +76,7 @@ def _same_look(back: Mesh, mesh: Mesh, tinted: bool) -> bool:
     if back.texture is not None and mesh.texture is not None:
         image, other = back.texture.image, mesh.texture.image
         return bool(image.shape == other.shape
-                    and np.abs(back.texture.corners - mesh.texture.corners).max() <= _ROUNDING
+                    and np.abs(back.texture.corners - mesh.texture.corners).max() <= ROUNDING
                     and (mesh.texture.kind != "png" or np.array_equal(image, other)))
     seen = ~mesh.inferred if tinted and mesh.inferred is not None else slice(None)
     return bool(np.abs(back.colors[seen].astype(int) - mesh.colors[seen]).max() <= 1)

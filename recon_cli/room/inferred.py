@@ -21,14 +21,13 @@ from recon_cli.kernels.thread_pool import pool
 from recon_cli.room.charts import plane_axes
 from recon_cli.room.depth_maps import DepthMaps
 from recon_cli.room.mesh_planes import face_geometry
-from recon_cli.room.planes import Plane, find_planes
+from recon_cli.room.planes import LEAST_COSINE, Plane, find_planes
 from recon_cli.room.texture import draw_mesh
 from recon_cli.room.texture_kernels import draw
 from recon_cli.scene.camera import Camera
 
 _BAND = 2.0  # voxels, within which surface belongs to a plane
 _NEAR = 6.0  # voxels, within which a bump is not a hole
-_LEAST_COSINE = 0.8  # between its normal and that of the plane
 _ACROSS = 0.2  # cosine between planes that meet, at most
 _CLOSED = 2  # cells of a gap in what surrounds a hole
 _REACH = 3.0  # cells, from a plane to the surface of another one that meets it
@@ -68,7 +67,7 @@ class _Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _DepthView:
     """A view of the scene."""
 
     camera: Camera
@@ -86,11 +85,11 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
     """
     centers, normals, areas = face_geometry(mesh.vertices, mesh.faces)
     planes = find_planes(centers, normals, areas, _BAND * voxel)
-    views = _look(maps, mesh)
+    views = _draw_depths(maps, mesh)
     vertices, faces, count = [], [], 0
-    sheets = [(plane, mesh.vertices[_own_faces(plane, mesh, voxel)]) for plane in planes]
-    for number, (plane, own) in enumerate(sheets):
-        others = [*sheets[:number], *sheets[number + 1:]]
+    patches = [(plane, mesh.vertices[_own_faces(plane, mesh, voxel)]) for plane in planes]
+    for number, (plane, own) in enumerate(patches):
+        others = [*patches[:number], *patches[number + 1:]]
         near = mesh.vertices[_near_faces(plane, mesh, _NEAR * voxel)]
         found = _close(plane, own, near, others, views, voxel) if len(own) else None
         if found is not None:
@@ -103,17 +102,17 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
                 np.zeros((count, 3), np.uint8), np.ones(count, bool))
 
 
-def _look(maps: DepthMaps, mesh: Mesh) -> list[_Look]:
+def _draw_depths(maps: DepthMaps, mesh: Mesh) -> list[_DepthView]:
     """Returns up to `_MOST_VIEWS` of the maps, evenly spread, and the mesh in them."""
     rows = np.unique(np.linspace(
         0, len(maps.cameras) - 1, min(len(maps.cameras), _MOST_VIEWS)).round().astype(int))
-    return [_Look(maps.cameras[row], maps.depths[row], draw_mesh(
+    return [_DepthView(maps.cameras[row], maps.depths[row], draw_mesh(
         maps.cameras[row], mesh.vertices, mesh.faces).nearness) for row in rows]
 
 
 def _close(
     plane: Plane, own: NDArray[np.float64], near: NDArray[np.float64],
-    others: Sequence[tuple[Plane, NDArray[np.float64]]], views: Sequence[_Look], voxel: float,
+    others: Sequence[tuple[Plane, NDArray[np.float64]]], views: Sequence[_DepthView], voxel: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Returns vertices and triangles that close the holes of a plane; None if it has none.
 
@@ -137,7 +136,7 @@ def _close(
     holes = _without_specks(_adjoining(holes, confirmed, lines | meets))
     if not holes.any():
         return None
-    return _sheet(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
+    return _patch_mesh(grid, holes, confirmed, np.where(confirmed, heights, 0.0))
 
 
 def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
@@ -146,7 +145,7 @@ def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
     near = np.abs(corners @ plane.normal - plane.offset).max(axis=1) < _BAND * voxel
-    return np.asarray(mesh.faces[near & (normals @ plane.normal > _LEAST_COSINE * lengths)])
+    return np.asarray(mesh.faces[near & (normals @ plane.normal > LEAST_COSINE * lengths)])
 
 
 def _near_faces(plane: Plane, mesh: Mesh, reach: float) -> NDArray[np.int64]:
@@ -241,7 +240,7 @@ def _pad_close(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _is_plane(
-    places: NDArray[np.float64], views: Sequence[_Look]
+    places: NDArray[np.float64], views: Sequence[_DepthView]
 ) -> NDArray[np.bool_]:
     """Returns at which places [N] views show the plane, and next to none looks through it.
 
@@ -249,27 +248,13 @@ def _is_plane(
     """
     agree, crossed = np.zeros((2, len(places)))
     for view in views:
-        z, inside, row, column = _pixels(view.camera, places)
-        seen = view.depth[row, column]
-        hidden = view.nearness[row, column] > (1 + _AGREE) / z  # behind the mesh
-        looks = inside & ~hidden & (seen > 0)
-        agree += looks & (np.abs(seen - z) <= _AGREE * z)
-        crossed += looks & (seen > (1 + _AGREE) * z)
+        rows, column, line, z = view.camera.find_visible(places)
+        seen = view.depth[line, column]
+        hidden = view.nearness[line, column] > (1 + _AGREE) / z  # behind the mesh
+        looks = ~hidden & (seen > 0)
+        agree[rows] += looks & (np.abs(seen - z) <= _AGREE * z)
+        crossed[rows] += looks & (seen > (1 + _AGREE) * z)
     return np.asarray((agree > 0) & (crossed <= _MOST_CROSSED * (agree + crossed)))
-
-
-def _pixels(
-    camera: Camera, places: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """Returns depths, which places are in the image, and their rows and columns."""
-    local = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = np.where(local[:, 2] > 1e-6, local[:, 2], np.inf)
-    column = np.floor(camera.fx * local[:, 0] / z + camera.cx)
-    row = np.floor(camera.fy * local[:, 1] / z + camera.cy)
-    inside = (np.isfinite(z) & (column >= 0) & (row >= 0) & (column < camera.width)
-              & (row < camera.height))
-    return (z, inside, np.where(inside, row, 0).astype(np.int64),
-            np.where(inside, column, 0).astype(np.int64))
 
 
 def _without_specks(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -281,7 +266,7 @@ def _without_specks(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(large[labels])
 
 
-def _sheet(
+def _patch_mesh(
     grid: _Grid, holes: NDArray[np.bool_], confirmed: NDArray[np.bool_],
     heights: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

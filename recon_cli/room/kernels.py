@@ -10,12 +10,12 @@ import math
 
 from recon_cli.kernels.kernel import kernel
 from recon_cli.kernels.simd_functions import fetch_add
+from recon_cli.kernels.thread_pool import AT_ONCE
 
 SIDE = 8  # voxels along the side of a block
 CELLS = SIDE**3
-_BLOCKS_AT_ONCE, _VERTICES_AT_ONCE = 64, 256
 _HALF_DIAGONAL = 0.8660254  # of a cube
-_LEAST_COSINE = 0.1  # between ray and normal, for a view to count as one of this side
+LEAST_COSINE = 0.1  # between ray and normal, for a view to count as one of this side
 # columns of the counts of `observe`
 SHOWN, SEEN_THROUGH = 0, 1
 
@@ -39,10 +39,10 @@ def integrate(counter, blocks, values, weights, depth, gain, view, voxel, band, 
     reach = voxel * SIDE * _HALF_DIAGONAL + band
     widest = 1.5 * max(view.fx, view.fy)
     while True:
-        first = fetch_add(counter, 0, _BLOCKS_AT_ONCE)
+        first = fetch_add(counter, 0, AT_ONCE)
         if first >= len(blocks):
             break
-        for b in range(first, min(first + _BLOCKS_AT_ONCE, len(blocks))):
+        for b in range(first, min(first + AT_ONCE, len(blocks))):
             left, top, low = blocks[b, 0] * SIDE, blocks[b, 1] * SIDE, blocks[b, 2] * SIDE
             wx, wy, wz = ((left + 0.5 * SIDE) * voxel, (top + 0.5 * SIDE) * voxel,
                           (low + 0.5 * SIDE) * voxel)
@@ -98,10 +98,10 @@ def observe(counter, points, normals, view, depth, image, tolerance, near, count
     """
     R, t = view.R, view.t
     while True:
-        first = fetch_add(counter, 0, _VERTICES_AT_ONCE)
+        first = fetch_add(counter, 0, AT_ONCE)
         if first >= len(points):
             break
-        for i in range(first, min(first + _VERTICES_AT_ONCE, len(points))):
+        for i in range(first, min(first + AT_ONCE, len(points))):
             wx, wy, wz = points[i, 0], points[i, 1], points[i, 2]
             z = R[6] * wx + R[7] * wy + R[8] * wz + t[2]
             if z <= near:
@@ -115,7 +115,7 @@ def observe(counter, points, normals, view, depth, image, tolerance, near, count
             dx, dy, dz = view.center[0] - wx, view.center[1] - wy, view.center[2] - wz
             length = math.sqrt(dx * dx + dy * dy + dz * dz)
             cosine = (dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2]) / length
-            if seen <= 0 or cosine < _LEAST_COSINE:
+            if seen <= 0 or cosine < LEAST_COSINE:
                 continue
             if z < seen - tolerance * z:
                 counts[i, SEEN_THROUGH] += 1

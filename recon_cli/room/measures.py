@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from recon_cli.io.meshes import Mesh
 from recon_cli.room.mesh_planes import face_geometry
 from recon_cli.room.planes import Plane
+from recon_cli.room.scale_fusion import INTERVAL
 
 _LEVEL = 0.98  # cosine to up from which on a plane is level; 11 degrees
 _UPRIGHT = 0.10  # cosine to up up to which it is upright
@@ -23,7 +24,6 @@ _SAME = 0.96  # cosine within which two walls face the same way
 _SCATTER = 1.05  # times the distance of a wall; a cupboard is deeper, fog is not
 _LEAST_WALL = 0.25  # of the area of the largest wall that faces the same way
 _MOST_OUTSIDE = 0.1  # share of the floor outside the footprint, else the room is not convex
-_SIGMAS = 1.96  # of an interval of 95%, for a normal distribution
 # Share of a plane's scatter that its place is uncertain by: bumps of a wall are as long as
 # Gaussians, so that a wall has some tens of independent ones.
 _SHARE_OF_SPREAD = 0.5
@@ -156,7 +156,7 @@ def cut_mesh(mesh: Mesh, up: NDArray[np.float64], height: float) -> NDArray[np.f
 
 
 def _measure(value: float, error: float, scale_error: float) -> Measure:
-    return Measure(value, float(_SIGMAS * np.hypot(error, scale_error * value)))
+    return Measure(value, float(INTERVAL * np.hypot(error, scale_error * value)))
 
 
 def _outer_walls(
@@ -229,7 +229,7 @@ def _footprint(
     along = np.hypot(np.roll(errors, 1), np.roll(errors, -1))
     x, y = polygon.T
     area = float(abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2)
-    area_error = _SIGMAS * float(np.hypot(
+    area_error = INTERVAL * float(np.hypot(
         np.sqrt(((lengths * errors) ** 2).sum()), 2 * scale_error * area))
     return polygon, tuple(_measure(float(length), float(error), scale_error)
                           for length, error in zip(lengths, along, strict=True)), Measure(

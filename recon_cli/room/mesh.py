@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext
-from recon_cli.errors import ReconstructionError
+from recon_cli.errors import ReconstructionError, name_command
 from recon_cli.io.meshes import Mesh, simplify
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.kernels.viewpoint import viewpoint
@@ -28,6 +28,7 @@ from recon_cli.room.mesh_planes import surface_planes, vertex_normals
 from recon_cli.room.planes import Plane
 from recon_cli.room.sensor_depths import with_sensor
 from recon_cli.room.stereo_depths import with_stereo
+from recon_cli.room.texture import TOLERANCE
 from recon_cli.room.volume import BYTES, extract, find_blocks, fuse
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -41,7 +42,6 @@ _COARSER = 1.26  # of the voxel, for half the blocks to the area
 _MOST_COARSER = 8.0  # times; a mesh of a room in voxels of 16 cm is none
 _MOST_BYTES = 1_000_000_000  # of the volume
 _SHARE = 0.3  # of the free memory that the volume may take
-_TOLERANCE = 0.025  # of a depth, within which a view shows a vertex
 _LEAST_ISLAND = 50.0  # voxel faces; 2 dm^2 in rooms
 
 
@@ -87,7 +87,7 @@ def build_mesh(
     if not maps.median > 0:
         raise ReconstructionError(
             "There is no surface to make a mesh of: no view shows an opaque one.",
-            hint="Train longer, or look at the scene with `recon view`.")
+            hint=f"Train longer, or look at the scene with {name_command('view')}.")
     if len(views) > 1:
         means = splats.means.detach().cpu().numpy().astype(np.float64)
         maps = with_stereo(maps, (means.min(axis=0), means.max(axis=0)), ctx.progress)
@@ -113,7 +113,7 @@ def mesh_of(
     if not len(faces):
         raise ReconstructionError(
             "There is no surface to make a mesh of: the views do not agree on any.",
-            hint="Check the cameras with `recon report`, or train longer.")
+            hint=f"Check the cameras with {name_command('report')}, or train longer.")
     before = len(faces)
     vertices, faces = _used(*simplify(vertices, faces, max_triangles, ctx.threads))
     if not len(faces):
@@ -159,7 +159,7 @@ def observe_all(
     for view, camera, depth in zip(maps.views, maps.cameras, maps.depths, strict=True):
         pool.run(
             observe, vertices, normals, viewpoint(camera), depth.reshape(-1),
-            np.ascontiguousarray(view.image).reshape(-1), _TOLERANCE, float(maps.near), counts,
+            np.ascontiguousarray(view.image).reshape(-1), TOLERANCE, float(maps.near), counts,
             colors, scratch=False)
     return counts, colors
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from html import escape
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
+from recon_cli.io.svg import PlanLayout, element, join_points, label
 from recon_cli.room.measures import RoomMeasures
 
 _WIDTH, _MARGIN, _LINE = 800, 60, 18  # pixels
@@ -22,25 +23,24 @@ def draw_plan(measures: RoomMeasures) -> str:
     cut = cut[:: max(1, -(-len(cut) // _MOST_SEGMENTS))]
     low, high = _bounds(cut, footprint)
     scale = (_WIDTH - 2 * _MARGIN) / float(max(high - low))
-    drawn = (high - low) * scale + 2 * _MARGIN
-
-    def at(places: NDArray[np.float64]) -> NDArray[np.float64]:
-        pixels = (places - low) * scale + _MARGIN
-        return np.stack([pixels[..., 0], drawn[1] - pixels[..., 1]], axis=-1)
-
-    parts = [_cut_path(at(cut))] if len(cut) else []
+    width, bottom = map(float, (high - low) * scale + 2 * _MARGIN)
+    layout = PlanLayout(scale, low - _MARGIN / scale, bottom)
+    parts = [element("title", "Plan of the room"),
+             element("rect", width="100%", height="100%", fill="white")]
+    if len(cut):
+        parts.append(_cut_path(layout.at(cut)))
     if footprint is not None:
-        parts.append(_walls(at(footprint), measures))
+        parts += _walls(layout.at(footprint), measures)
     lines = describe(measures)
-    height = drawn[1] + _LINE * (len(lines) + 1)
-    parts += [f'<text x="{_MARGIN}" y="{drawn[1] + _LINE * row:.0f}">{escape(line)}</text>'
+    height = round(bottom + _LINE * (len(lines) + 1))
+    parts += [element("text", line, x=_MARGIN, y=round(bottom + _LINE * row))
               for row, line in enumerate(lines)]
-    parts.append(_scale_bar(scale, float(drawn[0]), float(drawn[1])))
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {drawn[0]:.0f} {height:.0f}" '
-        f'width="{drawn[0]:.0f}" height="{height:.0f}" font-family="sans-serif" font-size="13">'
-        '<title>Plan of the room</title><rect width="100%" height="100%" fill="white"/>'
-        + "".join(parts) + "</svg>\n")
+    parts.append(layout.scale_bar(
+        (width - _MARGIN, bottom - 14), 1, 5, stroke="black", fill="none"))
+    return element(
+        "svg", Markup("").join(parts), xmlns="http://www.w3.org/2000/svg",
+        viewBox=f"0 0 {width:.0f} {height}", width=round(width), height=height,
+        font_family="sans-serif", font_size=13) + "\n"
 
 
 def describe(measures: RoomMeasures) -> list[str]:
@@ -66,14 +66,14 @@ def _bounds(
     return low - room, high + room
 
 
-def _cut_path(pixels: NDArray[np.float64]) -> str:
-    path = "".join(f"M{a:.1f},{b:.1f}L{c:.1f},{d:.1f}" for (a, b), (c, d) in pixels)
-    return f'<path d="{path}" stroke="#888" stroke-width="1" fill="none"/>'
+def _cut_path(pixels: NDArray[np.float64]) -> Markup:
+    return element("path", d="".join(f"M{join_points(ends)}" for ends in pixels), stroke="#888",
+                   stroke_width=1, fill="none")
 
 
-def _walls(corners: NDArray[np.float64], measures: RoomMeasures) -> str:
-    outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
-    parts = [f'<polygon points="{outline}" fill="none" stroke="black" stroke-width="4"/>']
+def _walls(corners: NDArray[np.float64], measures: RoomMeasures) -> list[Markup]:
+    parts = [element("polygon", points=join_points(corners, " "), fill="none", stroke="black",
+                     stroke_width=4)]
     middle = corners.mean(axis=0)
     for start, end, length in zip(
             np.roll(corners, 1, axis=0), corners, measures.walls, strict=True):
@@ -82,14 +82,7 @@ def _walls(corners: NDArray[np.float64], measures: RoomMeasures) -> str:
         place = place + 22 * out / max(float(np.linalg.norm(out)), 1e-9)
         turn = math.degrees(math.atan2(end[1] - start[1], end[0] - start[0]))
         turn -= 180 * round(turn / 180)  # never upside down
-        parts.append(
-            f'<text x="{place[0]:.1f}" y="{place[1]:.1f}" text-anchor="middle" '
-            f'dominant-baseline="middle" transform="rotate({turn:.1f} {place[0]:.1f} '
-            f'{place[1]:.1f})">{length.text("m")}</text>')
-    return "".join(parts)
-
-
-def _scale_bar(scale: float, width: float, bottom: float) -> str:
-    x, y = width - _MARGIN - scale, bottom - 14
-    return (f'<path d="M{x:.1f},{y - 5:.1f}v5h{scale:.1f}v-5" stroke="black" fill="none"/>'
-            f'<text x="{x + scale / 2:.1f}" y="{y - 8:.1f}" text-anchor="middle">1 m</text>')
+        parts.append(label(
+            float(place[0]), float(place[1]), length.text("m"), dominant_baseline="middle",
+            transform=f"rotate({turn:.1f} {place[0]:.1f} {place[1]:.1f})"))
+    return parts

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 _TRIALS = 400  # candidates for each plane, each through one point along its normal
 _SAMPLE = 12_000  # points that candidates are scored on
-_LEAST_COSINE = 0.8  # between a plane and the normals of its points: reconstructed walls are bumpy
+LEAST_COSINE = 0.8  # between a plane and the normals of its points: reconstructed walls are bumpy
 _MOST_PLANES = 24
 _LEAST_SHARE = 0.015  # of the total area; a wall of a room is some per cent, a table less
 _STEPS = 8  # of the reweighted fit; it converges in about four
@@ -51,7 +51,7 @@ def find_planes(
         trials = chosen[generator.permutation(len(chosen))[:_TRIALS]]
         apart = np.abs(points[chosen] @ normals[trials].T
                        - (points[trials] * normals[trials]).sum(1))
-        alike = normals[chosen] @ normals[trials].T > _LEAST_COSINE
+        alike = normals[chosen] @ normals[trials].T > LEAST_COSINE
         scores = ((apart < band) & alike).T.astype(np.float64) @ areas[chosen]
         best = trials[scores.argmax()]
         plane = _fit(points, normals, areas, left, normals[best],
@@ -70,7 +70,7 @@ def _fit(
 ) -> Plane | None:
     for step in range(_STEPS):
         share = (points[left] @ normal - offset) / (band * (2 if step < _STEPS // 2 else 1.5))
-        inside = (np.abs(share) < 1) & (normals[left] @ normal > _LEAST_COSINE)
+        inside = (np.abs(share) < 1) & (normals[left] @ normal > LEAST_COSINE)
         rows = left[inside]
         if len(rows) < 3:
             return None

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import ConfigError
-from recon_cli.io.colmap import Pinhole
+from recon_cli.scene.camera import Camera, Lens
 
 # where the scale comes from
 ARBITRARY, DATA_SET, MEASURED, FUSED = "arbitrary", "data set", "measured", "fused"
@@ -87,7 +87,7 @@ def measure(
     request: ScaleBetween,
     points: NDArray[np.float64],  # [P, 3] sparse points
     viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera of each frame
-    pinholes: Mapping[str, Pinhole],  # needed only of frames that are named with a pixel
+    pinholes: Mapping[str, Lens],  # needed only of frames that are named with a pixel
 ) -> Measurement:
     """Returns the metres of a world unit; ConfigError if a place is unknown or both are equal."""
     (a, a_reach), (b, b_reach) = (
@@ -133,7 +133,7 @@ def _locate(
     place: Place,
     points: NDArray[np.float64],
     viewmats: Mapping[str, NDArray[np.float64]],
-    pinholes: Mapping[str, Pinhole],
+    pinholes: Mapping[str, Lens],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns a place [3], and the way [3] from the camera whose pixel it is, else 0."""
     if place.frame is None:
@@ -143,30 +143,30 @@ def _locate(
     if place.pixel is None:
         return center, np.zeros(3)
     u, v = place.pixel
-    pinhole = pinholes.get(place.frame)
-    if pinhole is None:
+    lens = pinholes.get(place.frame)
+    if lens is None:
         raise ConfigError(
             f"{place.frame} is a panorama or of a wide lens: several undistorted images show it, "
             "so that none can be pointed into.",
             hint="Name frames (their cameras) or points x,y,z instead of FRAME:u,v.")
-    depth = _depth_at(place.frame, u, v, points @ viewmat[:3, :3].T + viewmat[:3, 3], pinhole)
-    ray = np.array([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy, 1.0])
-    reach = np.asarray(viewmat[:3, :3].T @ (depth * ray))
-    return center + reach, reach
+    camera = lens.pinhole(viewmat)
+    depth = _depth_at(place.frame, u, v, points, camera)
+    (point,) = camera.unproject(np.array([[u, v]]), np.array([depth]))
+    return point, point - center
 
 
 def _depth_at(
-    frame: str, u: float, v: float, points: NDArray[np.float64], pinhole: Pinhole
+    frame: str, u: float, v: float, points: NDArray[np.float64], camera: Camera
 ) -> float:
-    """Returns the depth of the point nearest to a pixel, of points [P, 3] in camera axes."""
-    if not (0 <= u <= pinhole.width and 0 <= v <= pinhole.height):
+    """Returns the depth of the point [P, 3] that is nearest to a pixel."""
+    if not (0 <= u <= camera.width and 0 <= v <= camera.height):
         raise ConfigError(
             f"The pixel {u:g},{v:g} lies outside {frame}, which has "
-            f"{pinhole.width}x{pinhole.height} pixels once undistorted.", hint=_HINT)
-    points = points[points[:, 2] > 0]
-    pixels = points[:, :2] / points[:, 2:] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+            f"{camera.width}x{camera.height} pixels once undistorted.", hint=_HINT)
+    pixels, depths = camera.project(points)
+    pixels, depths = pixels[depths > 0], depths[depths > 0]
     off = np.hypot(*(pixels - (u, v)).T)
-    reach = max(_LEAST_REACH, _REACH * pinhole.width)
+    reach = max(_LEAST_REACH, _REACH * camera.width)
     if not (off <= reach).any():
         hint = "Pick a corner or a textured spot."
         if len(off):
@@ -174,4 +174,4 @@ def _depth_at(
         raise ConfigError(
             f"The depth at {frame}:{u:g},{v:g} is unknown: no sparse point lies within "
             f"{reach:.0f} pixels.", hint=hint)
-    return float(points[off.argmin(), 2])
+    return float(depths[off.argmin()])

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from recon_cli.io.images import reduce_view
 from recon_cli.room.depth_maps import DepthMaps, weigh
 from recon_cli.scene.train_view import SensorDepth, TrainView
+from recon_cli.stereo.depths import TOLERANCE
 
 _WINDOW = 5  # samples a side, whose mean has less noise; beside edges there are none
 _LEAST_SIDE = 32  # pixels; smaller maps show no surface
 # Of a depth, or standard deviations of the sensor's noise, beyond which it says otherwise.
-_TOLERANCE, _DEVIATIONS = 0.015, 2.0
+_DEVIATIONS = 2.0
 
 
 def with_sensor(maps: DepthMaps) -> DepthMaps:
@@ -34,7 +35,7 @@ def with_sensor(maps: DepthMaps) -> DepthMaps:
     for row, _, depth in added:
         sensor = maps.views[row].depth
         assert sensor is not None
-        allowed = max(_TOLERANCE, _DEVIATIONS * sensor.noise)
+        allowed = max(TOLERANCE, _DEVIATIONS * sensor.noise)
         for other, camera in enumerate(maps.cameras):
             if not np.array_equal(camera.viewmat, maps.cameras[row].viewmat):
                 continue

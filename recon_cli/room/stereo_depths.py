@@ -11,11 +11,18 @@ from numpy.typing import NDArray
 from recon_cli.io.images import reduce_view
 from recon_cli.progress import Progress
 from recon_cli.room.depth_maps import DepthMaps, weigh
-from recon_cli.room.volume import pixel_rays
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.covisibility import observe_points
+from recon_cli.scene.faces import pixel_rays
 from recon_cli.scene.gravity import find_gravity
-from recon_cli.stereo.depths import Levels, StereoView, find_depths, find_partners, unproject
+from recon_cli.stereo.depths import (
+    TOLERANCE,
+    Levels,
+    StereoView,
+    find_depths,
+    find_partners,
+    unproject,
+)
 
 _SIDE = 600  # pixels of the longer side at most
 _MOST_VIEWS = 150  # that get a depth map, evenly spread; about 2 CPU seconds each
@@ -23,7 +30,6 @@ _NEIGHBOURS = 20  # views that each is compared with; more of them find more of 
 _SAMPLES = 3000  # points looked at to find them
 _LEAST_PIXELS = 20  # with depth, to tell how near and far is searched
 _TAIL = 0.01  # of the pixels, which do not count for that
-_TOLERANCE = 0.015  # of a depth, beyond which the Gaussians say otherwise
 _RENDERED = 0.3  # weight of the Gaussians' depth, that of stereo being 1
 
 
@@ -60,7 +66,7 @@ def with_stereo(
         used.append(there.astype(np.float32))
         own = rendered[row]
         full = cv2.resize(depth, own.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        differs = (full > 0) & (np.abs(own - full) > _TOLERANCE * full)
+        differs = (full > 0) & (np.abs(own - full) > TOLERANCE * full)
         rendered[row] = np.where(differs, 0, own).astype(np.float32)
         weights[row] = np.where(differs, 0, weights[row]).astype(np.float32)
     added = weigh(views, [view.camera for view in views], found, used)

@@ -22,7 +22,7 @@ from recon_cli.room.mesh_planes import vertex_normals
 from recon_cli.room.texture_kernels import COLUMNS, GAIN, WEIGHT, bake, draw, shade
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import camera_row
+from recon_cli.stereo.depths import EDGE, camera_row
 
 _SHARPER = 4.0  # exponent of how sharp a view is, in its weight
 _CORRECTIONS = 2  # by what the texture misses of the photos
@@ -30,9 +30,8 @@ STEPS = 1 + _CORRECTIONS  # of each view
 _OFFSET, _STEP = 128, 2.0  # of bytes that say what is missed: no error, and levels of a step
 _SMALLEST = 256  # texels, of the last half
 MOST_PIXELS = 50_000_000  # of all photos; 11 bytes of each are in memory
-_TOLERANCE = 0.025  # of a depth, within which a view shows a texel
+TOLERANCE = 0.025  # of a depth, within which a view shows a texel or vertex
 _FEATHER = 6  # pixels within which a view fades towards what hides a surface
-_JUMP = 0.03  # of 1 / depth, from which on neighbouring pixels lie on two surfaces
 _SAMPLES = 6000  # vertices by which photos are compared
 _ROUNDS = 4  # of that comparison
 _DARK, _BRIGHT = 12.0, 243.0  # beyond, pixels may be clipped
@@ -52,16 +51,10 @@ def draw_mesh(camera: Camera, vertices: NDArray[np.float64], faces: NDArray[np.i
     """Returns which triangle each pixel shows, and how near it is."""
     nearness = np.zeros((camera.height, camera.width), np.float32)
     owners = np.full(nearness.shape, -1, np.int32)
-    pool.run(draw, project(camera, vertices), faces, nearness, owners, scratch=False)
+    pixels, depths = camera.project(vertices)
+    places = np.column_stack([pixels, 1 / np.where(depths > 0, depths, np.inf)])
+    pool.run(draw, places, faces, nearness, owners, scratch=False)
     return Drawn(nearness, owners)
-
-
-def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns column, row and 1 / depth [P, 3] of points; zeros for those behind the camera."""
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    near = 1 / np.where(local[:, 2] > 1e-6, local[:, 2], np.inf)
-    return np.stack([camera.fx * local[:, 0] * near + camera.cx,
-                     camera.fy * local[:, 1] * near + camera.cy, near], axis=1)
 
 
 def add_texture(
@@ -126,7 +119,7 @@ def paint(
         covered = np.zeros((side, side), np.uint8)
         pixels = np.concatenate([image.reshape(-1, 3) for image in images])
         pool.run(bake, places, outward, unseen, charts.faces, charts.corners * (side / size), table,
-                 starts.astype(np.int64), pixels, nearness, quality, _TOLERANCE, texture, covered)
+                 starts.astype(np.int64), pixels, nearness, quality, TOLERANCE, texture, covered)
         return fill_gaps(texture, covered > 0)
 
     painted = mean([view.image for view in views], table, colors[charts.rows], size)
@@ -196,7 +189,7 @@ def usable(
     bend = np.maximum(np.abs(nearness[1:-1, :-2] + nearness[1:-1, 2:] - 2 * middle),
                       np.abs(nearness[:-2, 1:-1] + nearness[2:, 1:-1] - 2 * middle))
     calm = np.zeros(nearness.shape, np.uint8)
-    calm[1:-1, 1:-1] = bend <= _JUMP * middle
+    calm[1:-1, 1:-1] = bend <= EDGE * middle
     if mask is not None:
         calm[~mask] = 0
     inner = cv2.distanceTransform(calm, cv2.DIST_L2, 3)
@@ -229,24 +222,22 @@ def _measure(
     view: TrainView, one: Drawn, points: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Returns logarithms of colour and of local contrast [P, 4] of points; NaN where not seen."""
-    camera = view.camera
-    places = project(camera, points)
-    ray = points - camera.center
-    cosine = -(ray * normals).sum(1) / np.linalg.norm(ray, axis=1)
-    column, row = np.floor(places[:, :2]).astype(int).T
-    inside = ((places[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < camera.width)
-              & (row < camera.height) & (cosine > _LEAST_COSINE))
-    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    inside &= np.abs(one.nearness[row, column] - places[:, 2]) < _TOLERANCE * places[:, 2]
+    rows, column, row, depth = view.camera.find_visible(points)
+    ray = points[rows] - view.camera.center
+    cosine = -(ray * normals[rows]).sum(1) / np.linalg.norm(ray, axis=1)
+    seen = (cosine > _LEAST_COSINE) & (
+        np.abs(one.nearness[row, column] - 1 / depth) < TOLERANCE / depth)
     if view.mask is not None:
-        inside &= view.mask[row, column]
+        seen &= view.mask[row, column]
     soft = cv2.blur(view.image, (5, 5)).astype(np.float64)
     gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     fine = cv2.blur(np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 1.5)), (9, 9))
     colors = soft[row, column]
-    fair = inside & (colors > _DARK).all(1) & (colors < _BRIGHT).all(1)
+    fair = seen & (colors > _DARK).all(1) & (colors < _BRIGHT).all(1)
     values = np.concatenate([colors, fine[row, column][:, None] + 0.5], axis=1)
-    return np.where(fair[:, None], np.log(np.maximum(values, 1e-3)), np.nan)
+    logs = np.full((len(points), 4), np.nan)
+    logs[rows[fair]] = np.log(np.maximum(values[fair], 1e-3))
+    return logs
 
 
 def _offsets(logs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,9 +9,9 @@ import math
 
 from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd_functions import fetch_add
+from recon_cli.kernels.thread_pool import AT_ONCE
 
 MOST_CANDIDATES = 4096  # views of a triangle; a float of each lies in the scratch of a thread
-_ROWS_AT_ONCE, _FACES_AT_ONCE, _LINES_AT_ONCE = 128, 64, 8
 _LEAST_COSINE = 0.05  # between ray and normal
 _LARGE = 6.0  # pixels; of smaller triangles a few places tell whether a view shows them
 # columns of a row of the table of views: as `stereo.depths.camera_row`, then the weight of the view
@@ -32,10 +32,10 @@ def draw(counter, places, faces, nearness, owners):
     """
     height, width = nearness.shape
     while True:
-        first = fetch_add(counter, 0, _ROWS_AT_ONCE)
+        first = fetch_add(counter, 0, AT_ONCE)
         if first >= height:
             break
-        last = min(first + _ROWS_AT_ONCE, height)
+        last = min(first + AT_ONCE, height)
         for f in range(len(faces)):
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             ya, yb, yc = places[a, 1], places[b, 1], places[c, 1]
@@ -92,10 +92,10 @@ def bake(counter, vertices, normals, colors, faces, corners, views, starts, pixe
     """
     size = len(texture)
     while True:
-        first = fetch_add(counter, 0, _FACES_AT_ONCE)
+        first = fetch_add(counter, 0, AT_ONCE)
         if first >= len(faces):
             break
-        for f in range(first, min(first + _FACES_AT_ONCE, len(faces))):
+        for f in range(first, min(first + AT_ONCE, len(faces))):
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             xa, ya = corners[a, 0], corners[a, 1]
             xb, yb, xc, yc = corners[b, 0], corners[b, 1], corners[c, 0], corners[c, 1]
@@ -254,10 +254,10 @@ def shade(counter, view, vertices, faces, corners, nearness, owners, levels, sta
     """
     height, width = owners.shape
     while True:
-        first = fetch_add(counter, 0, _LINES_AT_ONCE)
+        first = fetch_add(counter, 0, AT_ONCE)
         if first >= height:
             break
-        for row in range(first, min(first + _LINES_AT_ONCE, height)):
+        for row in range(first, min(first + AT_ONCE, height)):
             for column in range(width):
                 f = owners[row, column]
                 if f < 0:

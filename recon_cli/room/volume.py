@@ -17,7 +17,7 @@ from recon_cli.kernels.thread_pool import pool
 from recon_cli.kernels.viewpoint import viewpoint
 from recon_cli.room.depth_maps import DepthMaps
 from recon_cli.room.kernels import CELLS, SIDE, integrate
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.faces import pixel_rays
 
 BAND = 3.0  # truncation: voxels before and behind a surface
 BYTES = 8 * CELLS  # of a block
@@ -99,13 +99,6 @@ def extract(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     proper = ((triangles[:, 0] != triangles[:, 1]) & (triangles[:, 1] != triangles[:, 2])
              & (triangles[:, 2] != triangles[:, 0]))
     return (places / _PART + 0.5) * volume.voxel, triangles[proper]
-
-
-def pixel_rays(camera: Camera) -> NDArray[np.float64]:
-    """Returns the directions [H, W, 3] of all pixels in the axes of the camera, with z = 1."""
-    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    return np.stack(np.broadcast_arrays(u, v[:, None], 1.0), axis=-1)
 
 
 def _gather(

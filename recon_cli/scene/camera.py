@@ -48,6 +48,13 @@ class Lens:
         """Whether the image shows all directions (equirectangular)."""
         return self.model == PANORAMA
 
+    def pinhole(self, viewmat: NDArray[np.float64]) -> Camera:
+        """Returns a camera of the same focal lengths and principal point, without distortion."""
+        focals, _ = MODELS[self.model]
+        cx, cy = self.params[focals:focals + 2]
+        return Camera(
+            self.width, self.height, self.params[0], self.params[focals - 1], cx, cy, viewmat)
+
     def resized(self, width: int, height: int) -> Lens:
         """Returns the intrinsics of the same image resampled to width x height pixels."""
         if self.is_panorama:
@@ -115,6 +122,40 @@ class Camera:
     def center(self) -> NDArray[np.float64]:
         """The optical centre in world coordinates, [3]."""
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
+
+    def project(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the pixels [..., 2] of points [..., 3] in the world, and their depths [...].
+
+        Pixels are NaN where the depth is not above 0: behind the camera, or beside it.
+        """
+        local = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        depths = local[..., 2]
+        ahead = np.where(depths > 0, depths, np.nan)[..., None]
+        with np.errstate(over="ignore"):
+            pixels = (self.fx, self.fy) * local[..., :2] / ahead + (self.cx, self.cy)
+        return np.asarray(pixels), depths
+
+    def contains(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Returns which pixels [..., 2] are in the image, [...]; none that is NaN."""
+        return np.asarray(((pixels >= 0) & (pixels < (self.width, self.height))).all(axis=-1))
+
+    def find_visible(self, points: NDArray[np.float64]) -> tuple[
+            NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Returns the rows of the points [P, 3] in the image, their columns, lines and depths."""
+        pixels, depths = self.project(points)
+        rows = np.flatnonzero(self.contains(pixels))
+        columns, lines = pixels[rows].astype(np.int64).T
+        return rows, columns, lines, depths[rows]
+
+    def unproject(
+        self, pixels: NDArray[np.float64], depths: NDArray[np.floating]
+    ) -> NDArray[np.float64]:
+        """Returns the points [P, 3] in the world that lie at depths [P] in pixels [P, 2]."""
+        rays = np.column_stack([(pixels - (self.cx, self.cy)) / (self.fx, self.fy),
+                                np.ones(len(pixels))])
+        return np.asarray((rays * depths[:, None] - self.viewmat[:3, 3]) @ self.viewmat[:3, :3])
 
     def resized(self, width: int, height: int) -> Camera:
         """Returns the camera of the same view resampled to width x height pixels."""

@@ -230,8 +230,6 @@ def visible_depths(
 ) -> NDArray[np.float64]:
     """Returns the depths of the points within the middle `part` of a picture's sides."""
     sample = points[:: max(1, len(points) // _SAMPLES)]
-    local = sample @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    local = local[local[:, 2] > 0]
-    x = np.abs(local[:, 0] / local[:, 2] * camera.fx) < part * camera.width / 2
-    y = np.abs(local[:, 1] / local[:, 2] * camera.fy) < part * camera.height / 2
-    return np.asarray(local[x & y, 2])
+    pixels, depths = camera.project(sample)
+    off = np.abs(pixels - (camera.cx, camera.cy))
+    return depths[(off < (part * camera.width / 2, part * camera.height / 2)).all(axis=1)]

@@ -175,16 +175,12 @@ def observe_points(
     The view is divided into a grid; of the points in a field those count that are about as near as
     the nearest one.
     """
-    homogeneous = np.column_stack([points, np.ones(len(points))])
     views, seen = [], []
     for number, camera in enumerate(cameras):
-        x, y, depth = (homogeneous @ camera.viewmat[:3].T).T
-        ahead = depth > 0
-        safe = np.where(ahead, depth, 1)
-        u = (camera.fx * x / safe + camera.cx) / camera.width
-        v = (camera.fy * y / safe + camera.cy) / camera.height
-        inside = np.flatnonzero(ahead & (u >= 0) & (u < 1) & (v >= 0) & (v < 1))
-        field = (v[inside] * _GRID).astype(int) * _GRID + (u[inside] * _GRID).astype(int)
+        pixels, depth = camera.project(points)
+        inside = np.flatnonzero(camera.contains(pixels))
+        column, line = (pixels[inside] / (camera.width, camera.height) * _GRID).astype(int).T
+        field = np.minimum(line, _GRID - 1) * _GRID + np.minimum(column, _GRID - 1)
         nearest = np.full(_GRID**2, np.inf)
         np.minimum.at(nearest, field, depth[inside])
         visible = inside[depth[inside] <= _BEHIND * nearest[field]]

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError
-from recon_cli.workspace import atomic, layout
+from recon_cli.workspace import layout
+from recon_cli.workspace.steps import SUFFIX, StepFolder
 
 KEYPOINT_COLUMNS = 6  # x, y and the 2x2 matrix of its shape, which COLMAP writes for SIFT
+_ROWS = "rows"  # the step that leaves the rows of a database
 _TABLES = {"features": "descriptors", "matches": "two_view_geometries"}
 # A pair of images is numbered first * this + second (COLMAP, src/colmap/util/types.h).
 _PAIR_BASE = 2**31 - 1
@@ -45,40 +46,40 @@ _CONTENT = {"keypoints": "image_id", "descriptors": "image_id", "matches": "pair
 _FOUND = {"features": ("keypoints", "descriptors"), "matches": ("matches", "two_view_geometries")}
 
 
-def seal(path: Path) -> None:
-    """Writes the digests of all rows of a database beside it, for `keep_sealed`."""
+def record_rows(path: Path) -> None:
+    """Records the digests of all rows of a database beside it, for `restore_rows`."""
     try:
         with closing(_connect(path)) as connection:
             digests = _digest_rows(connection)
     except sqlite3.DatabaseError:  # whoever reads it next finds no digest that fits
         return
-    atomic.write_json(_digests_path(path), digests)
+    _log(path).finish(_ROWS, digests)
 
 
-def unseal(path: Path) -> None:
+def forget_rows(path: Path) -> None:
     """Deletes the digests of a database that no later run continues."""
-    layout.remove(_digests_path(path))
+    layout.remove(path.with_suffix(SUFFIX))
 
 
-def keep_sealed(path: Path) -> str | None:
-    """Deletes what was written to a database since it was sealed, as in a step that was killed.
+def restore_rows(path: Path) -> str | None:
+    """Deletes what was written to a database since `record_rows`, as in a step that was killed.
 
-    Returns the first step whose sealed rows were damaged since: "features", "matches", or None.
+    Returns the first step whose recorded rows were damaged since: "features", "matches", or None.
     """
     try:
-        sealed = atomic.read_json(_digests_path(path), dict)
+        recorded = _log(path).result(_ROWS)
         with closing(_connect(path)) as connection, connection:
             found = _digest_rows(connection)
             for step, tables in _FOUND.items():
-                if step == "features" and found["rest"] != sealed["rest"]:
+                if step == "features" and found["rest"] != recorded["rest"]:
                     return step
-                if any(found[step].get(row) != digest for row, digest in sealed[step].items()):
+                if any(found[step].get(row) != digest for row, digest in recorded[step].items()):
                     return step
-                for row in found[step].keys() - sealed[step].keys():
+                for row in found[step].keys() - recorded[step].keys():
                     for table in tables:
                         connection.execute(
                             f"DELETE FROM {table} WHERE {_CONTENT[table]} = ?", (int(row),))
-    except (FormatError, sqlite3.DatabaseError, KeyError, TypeError, AttributeError, ValueError):
+    except (sqlite3.DatabaseError, KeyError, TypeError, AttributeError, ValueError):
         return "features"
     return None
 
@@ -116,8 +117,8 @@ def _crc(row: Sequence[Any], value: int) -> int:
     return value
 
 
-def _digests_path(path: Path) -> Path:
-    return path.with_suffix(".digests.json")
+def _log(path: Path) -> StepFolder:
+    return StepFolder(path.parent, path.with_suffix(SUFFIX))
 
 
 def progress(path: Path, step: str) -> int:
@@ -184,7 +185,7 @@ def matched_ids(path: Path) -> list[tuple[int, int]]:
 
 def remove(path: Path) -> None:
     """Deletes a database together with SQLite's side files and its digests."""
-    unseal(path)
+    forget_rows(path)
     for suffix in ("", "-wal", "-shm", "-journal"):
         layout.remove(path.with_name(path.name + suffix))
 

@@ -1,4 +1,4 @@
-"""What the mapping process and its parent share: the job, the log of finished steps, the events.
+"""What the mapping process and its parent share: the job, its steps, the events.
 
 The parent writes a job; the process records each finished step, and reports one JSON object a line
 on its standard output: a phase begins, so many of its units are done, or an error.
@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, TypeVar
+from typing import BinaryIO, ClassVar
 
 from recon_cli.errors import (
     ConfigError,
@@ -24,10 +23,9 @@ from recon_cli.errors import (
     WorkspaceError,
 )
 from recon_cli.scene.camera import Lens
-from recon_cli.workspace import atomic, layout
-from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.journal import crc32
+from recon_cli.workspace import atomic, durable, layout
 from recon_cli.workspace.json_record import JsonRecord
+from recon_cli.workspace.steps import StepFolder
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 PLACED = "placed.json"  # in the folder of place, until the parent reads it: `PlacedPart`
@@ -35,11 +33,9 @@ DATABASE = "database.db"  # in the stage's folder: COLMAP's, of features and mat
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 POLL_SECONDS = 0.25  # between looks at what native code has done
 CLIP_SECONDS = 1e6  # from the start of a clip to that of the next, in the times of a job
-LOG_FILE = "steps.json"  # in the stage's folder: the finished steps
 STEPS = ("features", "matches", "model")
 SPLIT = "split"  # a step after the matches where a view graph is cut into segments
-_SELF = "self"  # in the log, beside the steps: its own checksum
-_ORDER = (*STEPS[:2], SPLIT, *STEPS[2:])
+ORDER = (*STEPS[:2], SPLIT, *STEPS[2:])  # each builds on those before it
 
 
 @dataclass(frozen=True)
@@ -133,6 +129,11 @@ class MappingJob(JsonRecord):
         """Models of the mappers that were tried, until one of them is the result."""
         return self.out / "rungs"
 
+    @property
+    def tried(self) -> StepFolder:
+        """The attempts that were made with the features and matches that are there."""
+        return StepFolder(self.attempts, key=StepFolder(self.out).digest("features", "matches"))
+
     def segment(self, index: int) -> Path:
         """The folder of a segment, laid out as that of the stage."""
         return self.out / "segments" / str(index)
@@ -148,7 +149,7 @@ class MappingJob(JsonRecord):
         keep = self.known_poses and self.pose_use == "keep"
         if keep and self.given_points and all(group.lens for group in self.groups):
             return STEPS[-1:]
-        steps = [step for step in _ORDER if step != SPLIT or self.split]
+        steps = [step for step in ORDER if step != SPLIT or self.split]
         return tuple(steps[:steps.index(self.last) + 1])
 
     def write(self, path: Path) -> None:
@@ -163,7 +164,7 @@ class MappingJob(JsonRecord):
         except ManifestError as error:
             raise FormatError(
                 f"{path} is not a mapping job: {error.message}.",
-                hint="`recon sfm` writes the jobs of segments; give it one of those.") from error
+                hint="Give one of those that sfm writes for segments.") from error
 
 
 @dataclass(frozen=True)
@@ -192,97 +193,11 @@ class PlaceJob(JsonRecord):
         return self.parts[self.part - 1]
 
 
-Record = TypeVar("Record", bound=JsonRecord)
-
-
-class StepLog:
-    """The finished steps in the stage's folder, or in one in it; written after every change."""
-
-    def __init__(self, out: Path) -> None:
-        self._out = out
-        self._steps: dict[str, dict[str, Any]] = {}
-        try:
-            steps = atomic.read_json(out / LOG_FILE, dict)
-        except FormatError:
-            return  # the first run, or a lost file: every step is done again
-        if steps.pop(_SELF, None) == sha256_json(steps):
-            self._steps = steps
-
-    def is_finished(self, step: str) -> bool:
-        """Returns whether a step was finished and its files are all there."""
-        entry = self._steps.get(step)
-        return entry is not None and all(
-            (self._out / name).is_file() and (self._out / name).stat().st_size == size
-            for name, (size, _) in entry["files"].items())
-
-    def result(self, step: str, kind: type[Record]) -> Record | None:
-        """Returns the recorded result of a finished step, else None, as for another version's."""
-        if not self.is_finished(step):
-            return None
-        try:
-            return kind.from_json(self._steps[step]["result"])
-        except ManifestError:
-            return None
-
-    def finish(
-        self, step: str, result: JsonRecord, folder: Path | None = None, also: Sequence[str] = ()
-    ) -> None:
-        """Records a step as finished, with its result and the files in the `folder` it wrote.
-
-        `also` are names of files that it wrote besides, where they are there.
-        """
-        besides = [path for path in (self._out / name for name in also) if path.is_file()]
-        files = digest_files(self._out, [*(() if folder is None else _files(folder)), *besides])
-        self._steps[step] = {"result": result.to_json(), "files": files}
-        self._write()
-
-    def find_damage(self) -> str | None:
-        """Returns the first finished step with a file that was damaged since; None without one."""
-        for step, entry in self._steps.items():
-            names = [self._out / name for name in entry["files"]]
-            if not self.is_finished(step) or digest_files(self._out, names) != entry["files"]:
-                return step
-        return None
-
-    def forget_from(self, step: str) -> None:
-        """Removes a step and all that build on it."""
-        for name in _ORDER[_ORDER.index(step):]:
-            self._steps.pop(name, None)
-        self._write()
-
-    def _write(self) -> None:
-        atomic.write_json(
-            self._out / LOG_FILE, {**self._steps, _SELF: sha256_json(self._steps)})
-
-
-def digest_files(out: Path, paths: Iterable[Path]) -> dict[str, list[int]]:
-    """Returns the size and CRC-32 of files by their names relative to `out`."""
-    return {path.relative_to(out).as_posix(): [path.stat().st_size, crc32(path)] for path in paths}
-
-
-def vouch(folder: Path) -> None:
-    """Writes the digests of the files of a finished folder beside it."""
-    atomic.write_json(_vouchers(folder), digest_files(folder, _files(folder)))
-
-
-def is_vouched(folder: Path) -> bool:
-    """Returns whether a folder is as it was finished."""
-    try:
-        digests = atomic.read_json(_vouchers(folder), dict)
-    except FormatError:
-        return False
-    return folder.is_dir() and digests == digest_files(folder, _files(folder))
-
-
-def _vouchers(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.digests.json")
-
-
 def publish(folder: Path, target: Path) -> None:
     """Moves a finished folder to its place, replacing what an interrupted run left there."""
-    for path in _files(folder):
-        with path.open("rb+") as file:
-            os.fsync(file.fileno())
+    for path in folder.rglob("*"):
+        if path.is_file():
+            durable.flush(path)
     layout.remove(target)
     folder.rename(target)
     atomic.sync_folder(target.parent)
@@ -293,11 +208,6 @@ def fresh_folder(folder: Path) -> Path:
     layout.remove(folder)
     folder.mkdir(parents=True)
     return folder
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    """Yields the files below a folder in a fixed order."""
-    return (path for path in sorted(folder.rglob("*")) if path.is_file())
 
 
 _ERRORS: dict[str, type[ReconError]] = {

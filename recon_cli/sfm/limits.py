@@ -5,6 +5,8 @@ What only one step counts by itself (rounds, samples, neighbours) stands in the 
 
 from __future__ import annotations
 
+from recon_cli.workspace import records as store
+
 # --- matches and features
 # COLMAP takes a pair of images for verified from so many inliers on
 # (TwoViewGeometryOptions.min_num_inliers); fewer keypoints or shared points cannot make a pair.
@@ -38,6 +40,8 @@ MAX_TRIALS = 2000
 # Pixels that a point may be off in a model, and a match from its epipolar line
 # (TwoViewGeometryOptions.ransac.max_error): COLMAP's.
 MAX_ERROR_PX = 4.0
+# Observations from which on a point tells something: two rays meet in whatever way.
+MIN_TRACK_LENGTH = 3
 # Degrees between the rays to a point: COLMAP drops a point of less.
 MIN_RAY_ANGLE_DEG = 1.5
 # The median of these angles in a model: 7 to 23 in good captures, 3.9 in one that failed.
@@ -45,9 +49,12 @@ MIN_PARALLAX_DEG = 2.0
 # Scale of Cauchy's loss, times the mean error. Cameras of two rooms came out at .54 and .47 cm
 # without it, at .34 and .19 with SHARP_RATIO of `mapper`, at .16 and .09 with both.
 LOSS_SCALE = 0.5
+# The same of fewer images than MIN_IMAGES_PRINCIPAL: their mean error is too small, since they
+# follow their points, and each observation is needed. See tests/bench/bench_thinned.py.
+FEW_LOSS_SCALE = 2.0
 
 # --- models
-MIN_FRAMES = 3  # two cameras have no third one to contradict them
+MIN_FRAMES = store.MIN_FRAMES
 # Fewer images of a camera cannot tell its principal point from a turn (COLMAP: min_model_size).
 MIN_IMAGES_PRINCIPAL = 10
 # Share of the frames that can be placed which a model must hold, else another mapper is tried. Two
@@ -67,8 +74,11 @@ MIN_COMMON_SHARE, MIN_LOOP_SHARE = 0.8, 0.5
 # What a way drifts: degrees, and displacement as a share of the way. Around a can whose label
 # repeats, pairs that only look alike are off by 116 degrees in the median.
 MAX_DRIFT_DEG, MAX_DRIFT = 15.0, 0.2
-# Times MAX_POINT_ERROR: how far apart the points of a join may be, in the median, once loops pull.
-MAX_TENSION = 3.0
+# Times MAX_POINT_ERROR: how far apart the points of a join may be, in the median, in a graph.
+MAX_RESIDUAL = 3.0
+# Images per image, besides those that should overlap, that it is matched with because they look
+# alike: enough to find a loop, whose frames are matched with more of each other then.
+LOOP_CANDIDATES = 2
 # Frames; pairs whose ends are nearer than this in the walk are one witness of a loop.
 NEAR_IN_WALK = 10
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from recon_cli.sfm.job import MappingJob, StepLog
+from recon_cli.sfm.job import MappingJob
 from recon_cli.workspace.json_record import KEY, JsonRecord
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import AttemptSummary, PartSummary, PosesSummary
 
 Names = tuple[str, ...]
@@ -82,9 +83,9 @@ class MappingResult:
     @classmethod
     def read(cls, job: MappingJob) -> MappingResult:
         """Returns what the log of a job says, all of whose steps are finished."""
-        log = StepLog(job.out)
-        model = log.result("model", ModelResult)
-        every = {step: log.result(step, StepResult) for step in job.steps}
+        log = StepFolder(job.out)
+        model = log.find("model", ModelResult)
+        every = {step: log.find(step, StepResult) for step in job.steps}
         assert model is not None, "the mapping process ended without a model"
         return cls(
             model, {step: each.seconds for step, each in every.items() if each},

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import TERMS
 from recon_cli.splats.format import Origin
+from recon_cli.splats.values import measure_extent
 
 _MOST_BAD = 0.5  # of all rows; a file with more does not match its header
 # Fewer Gaussians, or nearly equal opacities, are not enough evidence.
@@ -26,7 +27,6 @@ _ENOUGH, _SPREAD = 50, 0.25
 # Gaussians whose centre is within one size of a place, on the mean: .003 in a trained room, but 45
 # if its sizes are read as logarithms.
 _COVERED = 1.0
-_BULK = 0.9  # share of the Gaussians that determines the size of the scene
 _ROUNDING = 0.1  # of the median Gaussian's size: float32 cannot hold positions that move by more
 _MOST_DEGREE = 10
 _MOST_LOG_OPACITY = -1e-15  # an opacity of exactly 1 has no logit
@@ -144,8 +144,7 @@ def undo_activations(path: Path, columns: Columns) -> Columns:
 
 def _covers_everything(means: NDArray[Any], log_scales: NDArray[Any]) -> bool:
     """Returns whether many Gaussians would cover each place if these were logarithms."""
-    away = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    radius = float(np.quantile(away, _BULK))
+    _, radius = measure_extent(means)
     size = float(np.median(log_scales))
     return radius > 0 and math.log(len(means)) + 3 * (size - math.log(radius)) > math.log(_COVERED)
 

@@ -23,6 +23,7 @@ import json
 import logging
 import struct
 from collections.abc import Iterator, Mapping
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,6 @@ _UP = {"z": Z_UP, "-y": Y_DOWN, "y": Y_UP}
 _NAME = "KHR_gaussian_splatting"
 _SUPPORTED = (_NAME, "KHR_mesh_quantization")  # of the extensions that a file may require
 _COLOR_SPACE = "srgb_rec709_display"
-_FLOAT, _VERTICES, _POINTS = 5126, 34962, 0
 _DEFAULTS = {"kernel": "ellipse", "colorSpace": _COLOR_SPACE}
 # Distance from 1 of the nearest opacity below it in float32: a logit has to be finite.
 _LEAST_OPACITY = 2.0 ** -24
@@ -75,11 +75,19 @@ _MAGIC, _VERSION = b"glTF", 2
 _JSON, _BIN = b"JSON", b"BIN\0"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _JSON_LIMIT = 1 << 22  # bytes; a scene needs a thousandth of it
-_LARGEST = (1 << 32) - 1  # bytes: the header's length has 32 bits
+_LARGEST = int(np.iinfo(np.uint32).max)  # bytes: the header's length has 32 bits
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 logger = logging.getLogger("recon")
+
+
+class _Gl(IntEnum):
+    """Numbers of OpenGL that glTF takes over."""
+
+    POINTS = 0
+    FLOAT = 5126
+    ARRAY_BUFFER = 34962
 
 
 def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -> None:
@@ -132,10 +140,10 @@ def _describe(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     views, accessors, start = [], [], 0
     for at, (name, column) in enumerate(columns.items()):
         views.append({"buffer": 0, "byteOffset": start, "byteLength": column.nbytes,
-                      "target": _VERTICES})
+                      "target": _Gl.ARRAY_BUFFER})
         start += column.nbytes
         accessor: dict[str, Any] = {
-            "bufferView": at, "componentType": _FLOAT, "count": len(column),
+            "bufferView": at, "componentType": _Gl.FLOAT, "count": len(column),
             "type": _TYPES[column.shape[1]]}
         if name == "POSITION":
             accessor |= {"min": column.min(axis=0).tolist(), "max": column.max(axis=0).tolist()}
@@ -144,7 +152,7 @@ def _describe(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         "asset": {"version": "2.0", "generator": "recon"}, "extensionsUsed": [_NAME],
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{
-            "attributes": {name: at for at, name in enumerate(columns)}, "mode": _POINTS,
+            "attributes": {name: at for at, name in enumerate(columns)}, "mode": _Gl.POINTS,
             "extensions": {_NAME: _DEFAULTS}}]}],
         "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": start}],
     }
@@ -236,7 +244,7 @@ def _read_primitive(
     container: Container, primitive: dict[str, Any], extension: dict[str, Any]
 ) -> Splats:
     attributes = primitive.get("attributes")
-    if not isinstance(attributes, dict) or primitive.get("mode") != _POINTS:
+    if not isinstance(attributes, dict) or primitive.get("mode") != _Gl.POINTS:
         raise container.error("Gaussians that are not points")
     if extension.get("extensions"):
         raise container.error(f"Gaussians with the extensions {extension['extensions']!r:.200}")

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.camera import Camera
+from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import UP, turn_from
 from recon_cli.splats.format import LoadedScene, SplatFormat, Tour, WriteSettings
@@ -37,7 +37,7 @@ from recon_cli.splats.spz import (
     spz_bytes,
     spz_scene,
 )
-from recon_cli.splats.values import read_contents
+from recon_cli.splats.values import measure_extent, read_contents
 from recon_cli.workspace.atomic import write_bytes
 
 View = tuple[str, Camera]
@@ -64,7 +64,6 @@ MODULES = {
 }
 LICENCES = ("LICENSE-three.txt", "LICENSE-spark.txt", "LICENSE-fflate.txt")
 _STORED = "rub"  # axes that the page turns back; the turn is its own inverse
-_BULK = 0.9  # share of the Gaussians that determines the size of the scene
 _LEVELS_FROM = 500_000  # Gaussians, of which Spark makes levels of detail
 _DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is measured on
 # At five, e^-10 units, the least scale, are .0015 units of the scene: in one of COLMAP, where some
@@ -86,25 +85,14 @@ class PageStyle:
     credits: bool = False  # whether it says what made it
 
 
-def measure_extent(means: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], float]:
-    """Returns the middle [3] and the radius of most of the centres [N, 3]."""
-    middle = np.median(means.astype(np.float64), axis=0)
-    reach = float(np.quantile(np.linalg.norm(means - middle, axis=1), _BULK))
-    return middle, reach or 1.0
-
-
 def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
     """Returns a camera in front of the scene and a little above it, looking at its middle."""
-    middle, reach = measure_extent(splats.means.detach().cpu().numpy())
+    middle, radius = measure_extent(splats.means.detach().cpu().numpy())
+    reach = radius or 1.0
     back = np.array([0.0, -1, 0]) if abs(up[1]) < 0.5 else np.array([0.0, 0, np.sign(up[1])])
     back -= (back @ up) * up
     offset = 2.5 * back / np.linalg.norm(back) + 0.5 * up
-    forward = -offset / np.linalg.norm(offset)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (middle + reach * offset)
+    viewmat = looking_at(middle + reach * offset, middle, up)
     width, height, focal = _DEFAULT_LENS
     return "", Camera(width, height, focal, focal, width / 2, height / 2, viewmat)
 
@@ -142,7 +130,8 @@ def _views(
 ) -> str:
     """Returns the element with the extent of the scene, the cameras and the tour."""
     means = splats.means.detach().cpu().double().numpy()
-    middle, reach = measure_extent(means)
+    middle, radius = measure_extent(means)
+    reach = radius or 1.0
     sample = means[::-(-len(means) // _DISTANCE_SAMPLES)]
     lenses: dict[tuple[float, ...], int] = {}
 
@@ -170,11 +159,8 @@ def _views(
 
 def _distance(means: NDArray[np.float64], camera: Camera) -> float:
     """Returns the median depth of the centres that a camera sees; 0 if it sees none."""
-    x, y, z = camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    visible = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return float(np.median(z[visible])) if visible.any() else 0.0
+    *_, depths = camera.find_visible(means)
+    return float(np.median(depths)) if len(depths) else 0.0
 
 
 @cache

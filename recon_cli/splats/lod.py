@@ -255,11 +255,6 @@ def load_lod(path: Path) -> LoadedScene:
         writer=index.generator(index.meta))
 
 
-def read_lod(path: Path) -> Splats:
-    """Returns the Gaussians of `load_lod`."""
-    return load_lod(path).splats
-
-
 class _Index(UntrustedFile):
     """An open lod-meta.json; every method raises FormatError if it breaks its own promises."""
 

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
 from recon_cli.splats.foreign import (
@@ -70,7 +70,7 @@ _MAX_LOGIT = math.log(254.75 / 0.25)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
 # the comment in the header: how many rows at the end show a backdrop, and its numbers
 _BACKDROP = re.compile(r"backdrop (\d{1,9})((?: \S+){7})")
-_ROUNDING = 1e-6  # of a value: by how much two machines may differ
+ROUNDING = 1e-6  # of a value: by how much two machines may differ
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 logger = logging.getLogger("recon")
@@ -297,7 +297,7 @@ def _without_sphere(splats: Splats, header_backdrop: tuple[int, Backdrop] | None
     near = splats.select(torch.arange(len(splats) - count))
     found = dataclasses.replace(near, backdrop=backdrop)
     ours = found.with_sphere().parameters()
-    same = all(ours[name].shape == value.shape and torch.allclose(ours[name], value, rtol=_ROUNDING)
+    same = all(ours[name].shape == value.shape and torch.allclose(ours[name], value, rtol=ROUNDING)
                for name, value in splats.parameters().items())
     return found if same else splats
 
@@ -339,7 +339,7 @@ def _vertices(header: Header) -> NDArray[np.void]:
     if row is not None and "packed_position" in (row.names or ()):
         raise FormatError(
             f"{header.path} is a compressed .ply, which has another layout.",
-            hint="Use `recon import` or `recon convert`, which read it.")
+            hint=f"Use {name_command('import')} or {name_command('convert')}, which read it.")
     tables = read_tables(header)
     if row is None:
         raise FormatError(f"{header.path} holds vertices with lists, which Gaussians do not have.",

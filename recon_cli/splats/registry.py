@@ -9,25 +9,24 @@ from pathlib import Path
 
 import torch
 
-from recon_cli.errors import FormatError, InputError
+from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
-from recon_cli.splats.values import read_start
+from recon_cli.splats.values import MOST_HEAD_BYTES, read_start
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, READABLE, ExportFormat
 
 logger = logging.getLogger("recon")
 
 FORMATS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in EXPORT_FORMATS.values() if row.module}
-_START = 1 << 20  # bytes of a file that its format is found in
 _READERS: dict[str, SplatFormat] = {
     row.name: import_module(row.module).FORMAT for row in READABLE}
 
 
 def format_of(path: Path) -> ExportFormat:
     """Returns the row of a file by its first bytes, or else by its name; FormatError if unknown."""
-    start = read_start(path, _START) if path.is_file() else b""
+    start = read_start(path, MOST_HEAD_BYTES) if path.is_file() else b""
     found = [row for row in READABLE if row.signature and row.signature.match(start)]
     return found[0] if found else _format_by_name(path)
 
@@ -37,8 +36,8 @@ def _format_by_name(path: Path) -> ExportFormat:
     if not found:
         raise FormatError(
             f"{path} is not of a known format of Gaussians.",
-            hint=f"Known are {', '.join(row.ending for row in READABLE)}; `recon run` reads videos "
-            "and photos.")
+            hint=f"Known are {', '.join(row.ending for row in READABLE)}; "
+            f"{name_command('run')} reads videos and photos.")
     return max(found, key=lambda row: len(row.ending))  # .compressed.ply before .ply
 
 
@@ -69,8 +68,8 @@ def put_in_place(scene: LoadedScene, name: str) -> Splats:
     """Returns the Gaussians where the file `name` has them, with a warning if that rounds."""
     if scene.origin is None:
         return scene.splats
-    logger.warning("%s: %s, and added again here, rounded; `recon import` leaves it out",
-                   name, scene.origin.describe())
+    logger.warning("%s: %s, and added again here, rounded; %s leaves it out",
+                   name, scene.origin.describe(), name_command("import"))
     return replace(scene.splats, means=scene.splats.means + torch.tensor(scene.origin.point))
 
 

@@ -34,6 +34,7 @@ from recon_cli.scene.splats import TERMS, Splats
 from recon_cli.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
 from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.values import (
+    MOST_HEAD_BYTES,
     Bytes,
     Floats,
     UntrustedFile,
@@ -52,13 +53,11 @@ from recon_cli.workspace.paths import leads_out
 
 _LEAST_OPACITY = 1e-6  # that PlayCanvas reads for a byte of 0; a logit has to be finite
 ROW = 64  # palette entries in a row of their image
-_STEPS = 65535  # of a position along an axis
 _TAG = 252  # of a quaternion whose greatest component is w
 _ROOT2 = math.sqrt(2)  # only the greatest component of a unit quaternion exceeds 1 / sqrt(2)
-_MAX_ENTRIES = 65535  # of a palette, besides one of zeros: labels are 16 bits
+_MOST_16_BIT = int(np.iinfo(np.uint16).max)  # steps of a position; entries of a palette but 0
 _MAX_COUNT = 16383 * 16383  # pixels of the largest WebP
 META = "meta.json"
-_META_LIMIT = 1 << 20  # bytes; three codebooks of 256 numbers need a hundredth of it
 _SMALL = 1 << 20  # Gaussians or pixels that are always accepted: a few hundred MB
 _START, _ENTRY = b"PK\x03\x04", b"PK\x01\x02"  # of the file, and of each entry of its directory
 _ENTRIES = 64  # a .sog has eight
@@ -191,7 +190,7 @@ def _read_harmonics(
     if meta.get("shN") is None:
         return np.zeros((0, 0, 3), np.float32)
     part = archive.part(meta, "shN")
-    count = archive.integer(part, "count", 1, _MAX_ENTRIES + 1)
+    count = archive.integer(part, "count", 1, _MOST_16_BIT + 1)
     terms = TERMS[archive.integer(part, "bands", 1, 3)]
     entries_name, labels_name = archive.files(part, 2)
     width, lines = ROW * terms, -(-count // ROW)
@@ -209,13 +208,13 @@ def pack_means(means: Floats) -> tuple[Doubles, Doubles, NDArray[np.int64]]:
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     low, high = logs.min(axis=0), logs.max(axis=0)
     span = np.where(high > low, high - low, 1)
-    return low, high, np.rint((logs - low) / span * _STEPS).astype(np.int64)
+    return low, high, np.rint((logs - low) / span * _MOST_16_BIT).astype(np.int64)
 
 
 def unpack_means(low_bytes: Bytes, high_bytes: Bytes, low: Doubles, high: Doubles) -> Floats:
     """Returns positions [N, 3]; infinite if the bounds are out of range."""
     steps = low_bytes.astype(np.float64) + 256.0 * high_bytes
-    logs = low + (high - low) * (steps / _STEPS)
+    logs = low + (high - low) * (steps / _MOST_16_BIT)
     with np.errstate(over="ignore"):
         return np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
 
@@ -235,7 +234,7 @@ def pack_harmonics(
     The first `colored` Gaussians have any; the others share an entry of zeros.
     """
     n, terms = sh_rest.shape[:2]
-    size = min(_MAX_ENTRIES, -(-colored // sharing))
+    size = min(_MOST_16_BIT, -(-colored // sharing))
     entries, labels = fit_palette(sh_rest[:colored].reshape(colored, -1), size, rng)
     # Neighbours in space get neighbouring numbers, so that both images compress.
     order = np.argsort(np.bincount(labels, np.arange(colored)) / np.bincount(labels))
@@ -265,7 +264,7 @@ class SogFiles(UntrustedFile):
 
     def meta(self) -> dict[str, Any]:
         """Returns the object in meta.json of version 2."""
-        meta = self.json_object(self.read(META, _META_LIMIT))
+        meta = self.json_object(self.read(META, MOST_HEAD_BYTES))
         if "version" not in meta and isinstance(meta.get("means"), dict):
             raise self.error("version 1 of the format, which is not supported")
         if self.integer(meta, "version", 0, sys.maxsize) != 2:

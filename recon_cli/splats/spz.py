@@ -23,6 +23,7 @@ import re
 import struct
 import zlib
 from dataclasses import dataclass, replace
+from enum import IntEnum, IntFlag
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,7 @@ from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.values import (
     HARMLESS_BYTES,
     MAX_RATIO,
+    MOST_HEAD_BYTES,
     Bytes,
     Floats,
     decode_opacities,
@@ -85,19 +87,29 @@ _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits, flags
 _MORE = struct.Struct("<I12x")  # of version 4: where the table of sizes begins
 _SIZES = struct.Struct("<QQ")  # packed, unpacked
 _EXTENSION = struct.Struct("<II")  # type, bytes that follow
-_HAS_EXTENSIONS = 2
-_EXTENSIONS_LIMIT = 1 << 20  # bytes
-_ADOBE, _ORBIT_CAMERA, _AXES = 0xADBE, 0xADBE0002, 0xADBE0003
 _AXES_RECORD = struct.Struct("<III")  # type, 4, and a number of AXES from 1; 0 means none
 _AXES_BY_UP = {"z": Z_UP, "-y": PLY, "y": "rub"}  # names in version 4 of axes as they are, by up
 # A header of gzip that has no time and no system; a comment up to a 0 follows and nothing else.
 _GZIP_HEADER = b"\x1f\x8b\x08\x10\0\0\0\0\0\xff"
 _COMMENT = re.compile(re.escape(_GZIP_HEADER) + rb"([ -~]{,40})\0")
-_ANTIALIASED = 1
 # Coefficients a channel that a file may have; those above degree 3 are cut off.
 _FILE_TERMS = (*TERMS, 24)
 _MAX_FRACTIONAL_BITS = 24
 _GZIP_LEVEL, _ZSTD_LEVEL = 6, 12  # those of Niantic's program
+
+
+class _Flag(IntFlag):
+    """Bits of the header."""
+
+    ANTIALIASED = 1
+    EXTENSIONS = 2
+
+
+class _Extension(IntEnum):
+    """Types of extensions; the upper half is the vendor, Adobe."""
+
+    ORBIT_CAMERA = 0xADBE0002
+    AXES = 0xADBE0003
 
 
 def write_spz(
@@ -275,13 +287,13 @@ def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
     """Returns the file of the six arrays, each of the header's size."""
     raw = [array.tobytes() for array in arrays]
     assert tuple(len(item) for item in raw) == header.sizes
-    flags = _ANTIALIASED if header.antialiased else 0
+    flags = _Flag.ANTIALIASED if header.antialiased else 0
     fields = (_MAGIC, header.version, header.count, header.sh_degree, header.fractional_bits)
     if header.version < 4:
         return _gzip(_HEAD.pack(*fields, flags, 0) + b"".join(raw), header.up)
     record = b"" if header.axes is None else _AXES_RECORD.pack(
-        _AXES, 4, 1 + AXES.index(header.axes))
-    flags |= _HAS_EXTENSIONS if record else 0
+        _Extension.AXES, 4, 1 + AXES.index(header.axes))
+    flags |= _Flag.EXTENSIONS if record else 0
     raw = [item for item in raw if item]
     packed = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(item) for item in raw]
     sizes = [_SIZES.pack(len(small), len(large)) for small, large in zip(packed, raw, strict=True)]
@@ -337,7 +349,7 @@ def _parse(path: Path, head: bytes, size: int) -> tuple[SpzHeader, int, int]:
     if bits > _MAX_FRACTIONAL_BITS:
         raise FormatError(f"{path} has positions of {bits} fractional bits, above 24: damaged.")
     header = SpzHeader(
-        version, count, degree, bits, antialiased=bool(flags & _ANTIALIASED))
+        version, count, degree, bits, antialiased=bool(flags & _Flag.ANTIALIASED))
     if not count or sum(header.sizes) > HARMLESS_BYTES + MAX_RATIO * size:
         raise FormatError(
             f"{path} promises {count} Gaussians, which do not fit into its {size} bytes.",
@@ -351,7 +363,7 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[SpzHeader, bytes, bytes]:
     header, flags, _ = _parse(path, head, len(data))
     if header.version == 4:
         raise FormatError(f"{path} is of version 4 but packed as older ones are: it is damaged.")
-    more = _EXTENSIONS_LIMIT if flags & _HAS_EXTENSIONS else header.gaussian_bytes
+    more = MOST_HEAD_BYTES if flags & _Flag.EXTENSIONS else header.gaussian_bytes
     body = stream.decompress(stream.unconsumed_tail, sum(header.sizes) + more)
     if not stream.eof and stream.decompress(stream.unconsumed_tail, 1):
         raise _too_long_error(path)
@@ -368,7 +380,7 @@ def _split_extensions(
     size = sum(header.sizes)
     if len(body) < size:
         raise _truncated_error(path)
-    if flags & _HAS_EXTENSIONS:
+    if flags & _Flag.EXTENSIONS:
         return body[:size], body[size:]
     accept_surplus(path, len(body) - size, header.gaussian_bytes)
     return body[:size], b""
@@ -386,7 +398,7 @@ def _unpack_streams(
     start = table + _SIZES.size * streams
     if streams != len(promised) or table < begin or start > len(data):
         raise FormatError(f"{path} has {streams} streams instead of {len(promised)}: damaged.")
-    extensions = data[begin:table] if flags & _HAS_EXTENSIONS else b""
+    extensions = data[begin:table] if flags & _Flag.EXTENSIONS else b""
     parts = []
     for i, size in enumerate(promised):
         packed, unpacked = _SIZES.unpack_from(data, table + _SIZES.size * i)
@@ -415,9 +427,9 @@ def _read_extensions(path: Path, data: bytes) -> str | None:
         if start + _EXTENSION.size > len(data):
             raise _truncated_error(path)
         kind, size = _EXTENSION.unpack_from(data, start)
-        if kind == _AXES:
+        if kind == _Extension.AXES:
             axes = _read_axes(path, data[start + _EXTENSION.size:start + _EXTENSION.size + size])
-        elif kind >> 16 == _ADOBE and kind != _ORBIT_CAMERA:
+        elif kind >> 16 == _Extension.AXES >> 16 and kind != _Extension.ORBIT_CAMERA:
             raise FormatError(
                 f"{path} has the extension {kind:#x}, which changes the meaning of its values.",
                 hint="Write it again without extensions.")

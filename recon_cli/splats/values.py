@@ -16,14 +16,29 @@ from recon_cli.errors import FormatError
 from recon_cli.scene.splats import Splats, with_rows
 from recon_cli.splats.axes import UP
 
+BULK = 0.9  # share of the Gaussians that determines the size of a scene; some lie far away
 _FAR = 10.0  # times the median distance of all from their middle
 _SHELL = 1.5  # outer distance over the inner one
 _BITS = 21  # per axis; three make a word of 63
 _LARGEST = float(np.finfo(np.float32).max)
 # Limits of what a file unpacks to. A .spz whose harmonics are all 0 reaches 5 times its size.
 HARMLESS_BYTES, MAX_RATIO = 1 << 24, 128
+MOST_HEAD_BYTES = 1 << 20  # of what describes a file; most need a hundredth of it
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
+
+
+def measure_extent(means: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], float]:
+    """Returns the middle [3] and the radius of most of the centres [N, 3]."""
+    middle = np.median(means.astype(np.float64), axis=0)
+    return middle, float(np.quantile(np.linalg.norm(means - middle, axis=1), BULK))
+
+
+def measure_distances(means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the distances [N] of centres [N, 3] from their middle and the radius of most."""
+    away = (means - means.median(dim=0).values).norm(dim=1)
+    # torch.quantile takes 16 million values at most
+    return away, away.sort().values[round(BULK * (len(away) - 1))]
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:

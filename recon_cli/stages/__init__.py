@@ -106,9 +106,9 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.ingest", input_metavar="VIDEO"),
     Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 4, True,
           "recon_cli.stages.denoise"),
-    Stage("sfm", "sfm", ("ingest",), (), SfmConfig, SfmSummary, 4, True,
+    Stage("sfm", "sfm", ("ingest",), (), SfmConfig, SfmSummary, 5, True,
           "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json", "verdict.json", "segments.json"),
+          ("database.db", "log.txt", "steps.json*", "verdict.json", "segments.json"),
           own_digests=True, options=tuple(
               item.name for item in fields(SfmConfig) if item.name not in _PLACE_OPTIONS)),
     Stage("place", "sfm", ("ingest", "denoise", "sfm"), (), SfmConfig, PlaceSummary, 1, True,

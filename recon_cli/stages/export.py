@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import StageError
+from recon_cli.errors import Hint, StageError
 from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.export.bounds import describe_bounds, describe_loss
 from recon_cli.export.coordinate_frame import ExportFrame, choose_frame, find_room_frame
@@ -33,7 +33,7 @@ from recon_cli.trust.ply_property import PLY_PROPERTY, expected_errors, match_ro
 from recon_cli.trust.scene_trust import measure_trust, refuse_without, views_looked_at
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, PLAN, TRANSFORM
-from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord, has_views
+from recon_cli.workspace.records import ImportRecord, has_views, need_views
 from recon_cli.workspace.summaries import ExportedFile, ExportSummary
 
 _PLY = "splats.ply"
@@ -93,7 +93,7 @@ class _Export:
         if self._config.model == "pruned" and not self._pruned:
             raise StageError(
                 "The pruned model was requested, but there is no fresh one.",
-                hint="Run `recon prune` first, or export with --model base.")
+                hint=Hint("prune", then=" first, or export with --model base"))
         for text in frame.fused.describe() if frame.fused else ():
             ctx.notice(text)
         splats, changes = self._reduced.bounded, self._reduced.changes
@@ -144,7 +144,7 @@ def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
     if record and record.doubt and config.drop_floaters:
         raise StageError(
             f"--drop-floaters needs views of the scene, but {record.doubt}.",
-            hint="Run `recon import` with another --frame, or from a file in the right one.")
+            hint=Hint("import", then=" with another --frame, or from a file in the right one"))
     if has_views(inputs.folders):
         return
     refused = [f"--format {name}" for name in config.formats if EXPORT_FORMATS[name].needs_views]
@@ -157,7 +157,7 @@ def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
     if refused:
         raise StageError(
             f"{' and '.join(refused)} cannot be used: the scene was imported without views.",
-            hint=NEEDS_VIEWS_HINT)
+            hint=need_views())
 
 
 def _write_transform(

@@ -97,12 +97,12 @@ def _describe(path: Path, scene: LoadedScene, alignment: Alignment | None) -> li
             "supported: details smaller than a pixel look too thick")
     if alignment is not None and alignment.doubt and path.suffix.lower() == ".spz":
         notices.append(
-            f"{path.name} may have other axes than it states, or than a .ply has: try `recon "
-            "import --axes rub`")
+            f"{path.name} may have other axes than it states, or than a .ply has: --axes rub "
+            "may be right")
     if scene.origin is not None and alignment is None:
         notices.append(
             f"{path.name}: {scene.origin.describe()}. Exported files have the new positions; "
-            "`recon export --transform` with that translation moves them back, rounded")
+            "--transform of export with that translation moves them back, rounded")
     return notices
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from recon_cli.capture import from_photos, from_video
-from recon_cli.capture.frame_selection import MIN_FRAMES
 from recon_cli.capture.images import PHOTO_SUFFIXES
 from recon_cli.capture.ingested_source import IngestedSource, merge_sources
 from recon_cli.capture.known_files import KNOWN_FILES, find_foreign, refuse_other_file
@@ -146,7 +145,7 @@ def _ingest(
 def _find_only_video(path: Path, out: Path, ctx: StageContext) -> Path:
     """Returns the one video in a folder without enough photos; any other path as it is."""
     videos = find_videos(path, out) if path.is_dir() else []
-    if len(videos) != 1 or len(find_photo_files(path, out).files) >= MIN_FRAMES:
+    if len(videos) != 1 or len(find_photo_files(path, out).files) >= store.MIN_FRAMES:
         return path
     ctx.notice(f"{path} holds one video and no photos of a scene: {videos[0].name} is used.")
     return videos[0]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, format_count, list_names
+from recon_cli.errors import ConfigError, Hint, format_count, list_names, name_command
 from recon_cli.sfm.job import PlaceJob
 from recon_cli.sfm.mapping import process
 from recon_cli.sfm.mapping.trusted_part import JOIN_PANORAMAS
@@ -71,7 +71,7 @@ def _refuse_missing_part(number: int, parts: Sequence[PartSummary]) -> None:
     named = ", ".join(f"{number} of {size} frames" for number, size in enumerate(sizes, 1))
     raise ConfigError(
         f"part is {number}, but the capture has {len(sizes)}: {named}.",
-        hint=f"Type `recon sfm --part {len(sizes)}`{' or a smaller number' * (len(sizes) > 1)}.")
+        hint=Hint("sfm", f"--part {len(sizes)}", then=" or a smaller number" * (len(sizes) > 1)))
 
 
 def _summary(
@@ -102,8 +102,8 @@ def _report(summary: PlaceSummary, frames: FrameList, ctx: StageContext) -> None
             ctx.notice(sentence)
     if sound and summary.rough:
         ctx.notice(f"{len(summary.rough)} of {summary.registered} cameras are rough, known badly "
-                   f"for too few points in common: {list_names(summary.rough)}; `recon report` "
-                   "says how badly.")
+                   f"for too few points in common: {list_names(summary.rough)}; "
+                   f"{name_command('report')} says how badly.")
     for sentence in (*_describe_parts(summary, frames),
                      *_describe_left_out(summary, frames, named=not sound)):
         ctx.notice(sentence)
@@ -144,8 +144,8 @@ def _describe_parts(summary: PlaceSummary, frames: FrameList) -> Iterator[str]:
         yield (f"Part {number} has {len(part.names)} of {summary.frames} frames: "
                f"{_stretches(frames, part.names)}.")
     other = 2 if summary.part == 1 else 1
-    yield (f"`recon sfm --part {other}` takes part {other}, without mapping again; `recon report` "
-           "shows what to film to join them.")
+    yield (f"{name_command(f'sfm --part {other}')} takes part {other}, without mapping again; "
+           f"{name_command('report')} shows what to film to join them.")
 
 
 def _describe_left_out(
@@ -164,7 +164,7 @@ def _describe_left_out(
         yield f"{name} was taken out of the model: {reason}."
     if missing and not (named and summary.lines):
         yield (f"Left out without a camera: {len(missing)} of {summary.frames} frames, "
-               f"{_stretches(frames, missing)}; `recon report` says why.")
+               f"{_stretches(frames, missing)}; {name_command('report')} says why.")
     if missing and any(group.lens is not None and group.lens.is_panorama
                        for group in frames.groups):
         yield JOIN_PANORAMAS

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, TrainingError
+from recon_cli.errors import ConfigError, Hint, TrainingError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import max_gaussians, write_ply
 from recon_cli.train.fit.loop import validation_psnr
@@ -35,7 +35,7 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     elif psnr_before is None:
         raise TrainingError(
             "--max-psnr-drop is measured on validation views, but the run has none.",
-            hint="Run `recon train --validation 0.05` first, or prune by --ratio.")
+            hint=Hint("train", "--validation 0.05", then=" first, or prune by --ratio"))
     else:
         prune_while_good(run, psnr_before, config.max_psnr_drop)
         if len(run.state.splats) == n:

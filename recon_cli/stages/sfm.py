@@ -15,7 +15,7 @@ from recon_cli.io.tracks import TRACKS, Tracks
 from recon_cli.jobs.executor import Executor, start_executor
 from recon_cli.scene.camera import MODELS, PANORAMA
 from recon_cli.sfm import database
-from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob
 from recon_cli.sfm.mapping import process
 from recon_cli.sfm.mapping.time_estimate import Workload, estimate_for_notice, format_minutes
 from recon_cli.sfm.poses.align_world import find_places
@@ -28,6 +28,7 @@ from recon_cli.workspace.records import (
     KnownPoses,
     read_poses,
 )
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import SfmSummary
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.
@@ -71,7 +72,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     process.run_job(job, progress=ctx.progress, record=ctx.record, on_idle=ctx.while_idle)
     summary = _summary(frames, runs, MappingResult.read(job))
     segments.remove_segments(job)
-    database.unseal(job.database)
+    database.forget_rows(job.database)
     return summary
 
 
@@ -124,7 +125,7 @@ def _time_limit(config: SfmConfig, frames: FrameList) -> float:
 
 def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
     """Tells how long the cameras will take, and the limit where it is near."""
-    if job.known_poses or job.pairs != "auto" or StepLog(job.out).is_finished("features"):
+    if job.known_poses or job.pairs != "auto" or StepFolder(job.out).is_finished("features"):
         return  # as asked for, or partly done
     mapped = segments.count_mapped(job)
     number = segments.count_segments(mapped, config.segments)

@@ -15,7 +15,7 @@ from pathlib import Path
 from recon_cli.config.protocols import SPLIT_WORDS
 from recon_cli.config.stages import SettledConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, format_count, list_names
+from recon_cli.errors import ConfigError, format_count, list_names, name_command
 from recon_cli.io.training_scene import load_scene
 from recon_cli.scene.scene import Scene
 from recon_cli.train.blocks import blocks
@@ -127,5 +127,5 @@ def _check_split(protocol: str, frames: Iterable[Frame]) -> None:
             f"{format_count(len(ordered), 'frame')}. Here "
             f"{len(set(held_out) & set(expected))} of these are held out, and "
             f"{len(set(held_out) - set(expected))} others.",
-            hint="Run `recon ingest --holdout every:8`. A data set with held-out views of its own "
-                 "keeps them: ingest a copy without them.")
+            hint=f"Run {name_command('ingest --holdout every:8')}. A data set with held-out views "
+                 "of its own keeps them: ingest a copy without them.")

@@ -35,8 +35,8 @@ _COMPARED = 14  # partners at most; what is level or refined is compared with al
 _LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
 # The second one, about what the first found: a window then follows slanted surfaces.
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
-_EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
-_TOLERANCE = 0.015  # of a depth, within which another view confirms it
+EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
+TOLERANCE = 0.015  # of a depth, within which another view confirms it
 _FRONTAL = np.zeros(3)  # planes parallel to each image
 _WINDOW, _TEXTURE = 5, 6.0  # pixels a side; deviation of grey levels at which a plane counts 1/e
 _SMALL = 16  # pixels a side
@@ -155,10 +155,7 @@ def unproject(
 ) -> NDArray[np.float64]:
     """Returns where some pixels of a depth map [H, W] lie, [N, 3] in world units."""
     line, column = np.divmod(pixels, depth.shape[1])
-    rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (line + 0.5 - camera.cy) / camera.fy,
-                     np.ones(len(pixels))], axis=1)
-    local = rays * depth.reshape(-1)[pixels, None] - camera.viewmat[:3, 3]
-    return np.asarray(local @ camera.viewmat[:3, :3])
+    return camera.unproject(np.stack([column, line], axis=1) + 0.5, depth.reshape(-1)[pixels])
 
 
 def compile_kernels() -> None:
@@ -213,7 +210,7 @@ def _enlarged(inverse: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[n
     size = shape[1], shape[0]
     nearest, linear = (cv2.resize(inverse, size, interpolation=way)
                        for way in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
-    return np.asarray(np.where(np.abs(linear - nearest) < _EDGE * nearest, linear, nearest))
+    return np.asarray(np.where(np.abs(linear - nearest) < EDGE * nearest, linear, nearest))
 
 
 def _laid_on_planes(
@@ -257,7 +254,7 @@ def _confirmed(
     for own, depth in enumerate(depths):
         agree, through = np.zeros((2, depth.size), np.int32)
         others = partners[own][partners[own] >= 0]
-        pool.run(compare, flat, starts, table, own, others, _TOLERANCE, near, agree, through,
+        pool.run(compare, flat, starts, table, own, others, TOLERANCE, near, agree, through,
                  scratch=False)
         confirmed.append(agree.reshape(depth.shape) > 0)
     return confirmed

@@ -16,7 +16,7 @@ from typing import Any
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError
+from recon_cli.errors import ConfigError, name_command
 from recon_cli.scene.splats import with_rows
 from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit.initialize import begin_state, restore_state
@@ -86,7 +86,7 @@ class FinishedModel:
             raise ConfigError(
                 f"max_gaussians is {asked.max_gaussians:,}, but the imported scene has "
                 f"{self.gaussians:,} Gaussians.",
-                hint="Leave out --max-gaussians, and let `recon prune` lower the count.")
+                hint=f"Leave out --max-gaussians, and let {name_command('prune')} lower the count.")
         own = model_parts(self.config)
         return {name: own[name] if value in (None, "auto") else value
                 for name, value in model_parts(asked).items()}

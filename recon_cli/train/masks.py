@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.context import EarlierResult
-from recon_cli.errors import FormatError, InputError, ManifestError
+from recon_cli.errors import FormatError, Hint, InputError, ManifestError
 from recon_cli.io.images import decode_file, fill_masked, read_mask, write_png
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import TrainView
@@ -146,7 +146,7 @@ def read_summary(folder: Path) -> MovingSummary | None:
     path = folder / MovingSummary.FILE
     if not path.exists():
         return None
-    hint = "Run `recon train --again`."
+    hint = Hint("train", again=True)
     try:
         return MovingSummary.from_json(read_json(path, dict, hint=hint))
     except ManifestError as error:

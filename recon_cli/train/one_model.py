@@ -12,7 +12,7 @@ from recon_cli.io.views import size_summary
 from recon_cli.scene.scene import Scene
 from recon_cli.splats.ply import write_ply
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.fit.runner import CHECKPOINT, LOG, Segment, run_fit
+from recon_cli.train.fit.runner import CHECKPOINT, LOG, RunSegment, run_fit
 from recon_cli.train.fit.state import TrainState, save_state
 from recon_cli.train.fit.task import Task
 from recon_cli.train.masks import EditedMasks, read_summary
@@ -38,7 +38,7 @@ def fit_scene(
         model.write_inherited_files(task.schedule, out, ctx)
     state = first_or_saved(task, scene, out / CHECKPOINT, model)
     until = task.schedule.config.iterations
-    run_fit(state, task, until, Segment(
+    run_fit(state, task, until, RunSegment(
         out, "train", until, first=task.schedule.first,
         keep={task.schedule.mid: "mid.safetensors"}), ctx)
     save_state(out / "final.safetensors", state)

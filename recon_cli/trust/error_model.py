@@ -25,7 +25,7 @@ from recon_cli.render.torch.projection import colors_from_sh
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.trust.support import Sight, Support, error_image
+from recon_cli.trust.support import ViewingGeometry, ViewSupport, error_image
 from recon_cli.workspace.summaries import JsonRecord
 
 # Weights without any evidence, and where to the fit is drawn: those of seven captures, rounded, a
@@ -66,7 +66,7 @@ class ErrorModel(JsonRecord):
         log = sum(self.weights[name] * terms[name] for name in TERMS) + self.bias
         return np.asarray(np.exp(np.minimum(log, 0)), np.float32)
 
-    def expect_gaussians(self, support: Support, sight: Sight) -> NDArray[np.float32]:
+    def expect_gaussians(self, support: ViewSupport, sight: ViewingGeometry) -> NDArray[np.float32]:
         """Returns the expected error [N] of Gaussians as seen from one place.
 
         What only a picture tells (holes, edges, spreads) is as in the mean.
@@ -75,7 +75,7 @@ class ErrorModel(JsonRecord):
         return self.expect(means | gaussian_terms(support, sight))
 
 
-def gaussian_terms(support: Support, sight: Sight) -> dict[str, NDArray[np.float32]]:
+def gaussian_terms(support: ViewSupport, sight: ViewingGeometry) -> dict[str, NDArray[np.float32]]:
     """Returns the terms [N] that are known for Gaussians without a picture."""
     return _shape_terms(
         (1 / (1 + support.count.float())).cpu().numpy(), sight.angle.cpu().numpy(),
@@ -99,7 +99,7 @@ class Picture:
     terms: Mapping[str, NDArray[np.float32]]  # [H, W] by the names of TERMS
 
 
-def picture_terms(model: RenderedModel, support: Support, camera: Camera) -> Picture:
+def picture_terms(model: RenderedModel, support: ViewSupport, camera: Camera) -> Picture:
     """Returns a view and the terms of its pixels, by two more passes with values for colours."""
     splats, backend = model.splats, model.backend
     device, dtype = splats.means.device, splats.means.dtype
@@ -172,7 +172,7 @@ def _edges(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def calibrate(
-    rendered: RenderedModel, support: Support, validation: Sequence[TrainView],
+    rendered: RenderedModel, support: ViewSupport, validation: Sequence[TrainView],
     train: Sequence[TrainView], *, gains: bool = False, on_view: Callable[[], None] = lambda: None,
 ) -> ErrorModel:
     """Returns the model fitted to the validation views, which no gradient came from.

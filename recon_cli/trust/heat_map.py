@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-FULL = 65_535  # steps of a 16-bit picture for an error of 1, the whole range of a channel
+FULL = int(np.iinfo(np.uint16).max)  # steps of a picture for an error of 1, all of a channel
 # Errors that are drawn blue and red; between them colours follow the logarithm, the same in every
 # scene. Two rendered rooms have .004 to .07 between the best and the worst tenth of the pixels.
 TRUSTED, INVENTED = 0.005, 0.2

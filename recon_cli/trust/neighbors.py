@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon_cli.render.contract import NEAR
+from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.trust.support import Support
+from recon_cli.trust.support import ViewSupport
 
 # One of so many views is rendered, but not fewer than `_LEAST`. Of what the others show on a walk
 # 97% is found, and 97% of what is found they show; shares of the surface change by .005.
@@ -56,9 +57,9 @@ def spread_views(apart: Array, count: int) -> list[int]:
 
 
 def support_of_all(
-    support: Support, splats: Splats, cameras: Sequence[Camera], apart: Array,
+    support: ViewSupport, splats: Splats, cameras: Sequence[Camera], apart: Array,
     rendered: Sequence[int],
-) -> Support:
+) -> ViewSupport:
     """Returns the support in all `cameras`; `support` is that in those at `rendered`.
 
     Another camera shows what one of the two nearest rendered ones shows, as far as it lies in its
@@ -78,14 +79,13 @@ def support_of_all(
             shown[support.rows[neighbor]] = True
         rows = torch.nonzero(shown)[:, 0]
         every.append(rows[_in_frame(splats.means[rows], radii[rows], camera)])
-    return Support.from_rows(every, centers, support.residual, support.digest)
+    return ViewSupport.from_rows(every, centers, support.residual, support.digest)
 
 
 def _in_frame(means: Tensor, radii: Tensor, camera: Camera) -> Tensor:
     """Returns which of K balls the frame of a camera touches, [K] bool."""
-    pose = torch.as_tensor(camera.viewmat, dtype=means.dtype, device=means.device)
-    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    pixels, z = TensorCamera.from_camera(camera, means).project(means)
+    u, v = pixels.unbind(1)
     wide, high = camera.fx * radii / z, camera.fy * radii / z
     return ((z > NEAR) & (u >= -wide) & (u < camera.width + wide)
             & (v >= -high) & (v < camera.height + high))

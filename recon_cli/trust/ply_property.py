@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.ply import ROUNDING
 from recon_cli.trust.scene_trust import Trust
-from recon_cli.trust.support import Sight
+from recon_cli.trust.support import ViewingGeometry
 
 PLY_PROPERTY = "expected_error"
-_ROUNDING = 1e-6  # of the greatest coordinate: float32 moves centres by less
 
 
 def expected_errors(splats: Splats, trust: Trust) -> NDArray[np.float32]:
@@ -23,7 +23,7 @@ def expected_errors(splats: Splats, trust: Trust) -> NDArray[np.float32]:
     """
     unseen = trust.support.count == 0
     angle = torch.where(unseen, torch.pi, 0.0).to(splats.means.dtype)
-    sight = Sight(angle.to(trust.support.residual.device),
+    sight = ViewingGeometry(angle.to(trust.support.residual.device),
                   torch.zeros_like(trust.support.residual))
     return trust.error.expect_gaussians(trust.support, sight)
 
@@ -36,4 +36,4 @@ def match_rows(means: Tensor, originals: NDArray[np.float64]) -> NDArray[np.int6
     """
     places = means.detach().cpu().double().numpy()
     apart, rows = cKDTree(originals).query(places)
-    return np.where(apart <= _ROUNDING * np.abs(places).max(initial=1.0), rows, -1)
+    return np.where(apart <= ROUNDING * np.abs(places).max(initial=1.0), rows, -1)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from recon_cli.trust.support import Support
+from recon_cli.trust.support import ViewSupport
 from recon_cli.trust.surface import CELL, MIN_SPAN_DEG, MIN_VIEWS, SurfaceCells
 from recon_cli.workspace.summaries import JsonRecord
 
@@ -54,7 +54,7 @@ class PoorlySeenRegion(JsonRecord):
 
 
 def find_poorly_seen(
-    cells: SurfaceCells, support: Support, frames: Sequence[str]
+    cells: SurfaceCells, support: ViewSupport, frames: Sequence[str]
 ) -> tuple[PoorlySeenRegion, ...]:
     """Returns the largest regions, the largest first; `frames` are the names of support's views."""
     regions = sorted(_find_regions(cells), key=len, reverse=True)
@@ -91,7 +91,7 @@ def _cut(grid: Grid, region: Grid) -> Iterator[Grid]:
 
 
 def _describe_region(
-    cells: SurfaceCells, region: Grid, support: Support, frames: Sequence[str]
+    cells: SurfaceCells, region: Grid, support: ViewSupport, frames: Sequence[str]
 ) -> PoorlySeenRegion:
     places = (cells.grid[region] + 0.5) * cells.size
     middle = places[np.linalg.norm(places - places.mean(axis=0), axis=1).argmin()]

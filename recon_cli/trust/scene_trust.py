@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import ManifestError, StageError
+from recon_cli.errors import Hint, ManifestError, StageError
 from recon_cli.evaluation.reference_views import RenderedModel, load_reference_views
 from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.camera import Camera
@@ -31,13 +31,13 @@ from recon_cli.trust.neighbors import (
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.support import (
     MAX_VIEWS,
-    Support,
+    ViewSupport,
     error_image,
     measure_support,
 )
 from recon_cli.trust.surface import SurfaceShares
 from recon_cli.workspace.atomic import read_json, write_json
-from recon_cli.workspace.records import NEEDS_VIEWS_HINT, ImportRecord
+from recon_cli.workspace.records import ImportRecord, need_views
 from recon_cli.workspace.summaries import JsonRecord
 
 FOLDER = "trust"  # in that of evaluate
@@ -88,7 +88,7 @@ class TrustRecord(JsonRecord):
         FormatError or ManifestError if it is damaged.
         """
         path = evaluate / FOLDER / RECORD
-        hint = "Run `recon eval --again`."
+        hint = Hint("eval", again=True)
         return TrustRecord.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
 
     def write(self, evaluate: Path) -> None:
@@ -114,7 +114,7 @@ class TrustRecord(JsonRecord):
 class Trust:
     """The trust of a model, ready to be rendered."""
 
-    support: Support
+    support: ViewSupport
     error: ErrorModel
     sh_degree: int
 
@@ -147,7 +147,7 @@ class Trust:
         stored = record and record.model_trust(model)
         if not stored:
             return None
-        support = Support.load(evaluate / FOLDER / f"{model}.safetensors")
+        support = ViewSupport.load(evaluate / FOLDER / f"{model}.safetensors")
         return Trust(support, stored.error, sh_degree) if support.digest == digest else None
 
 
@@ -173,7 +173,7 @@ def refuse_without(record: ImportRecord | None) -> None:
     """Raises StageError where a scene has no trust."""
     reason = why_none(record)
     if reason:
-        raise StageError(reason, hint=NEEDS_VIEWS_HINT)
+        raise StageError(reason, hint=need_views())
 
 
 def views_looked_at(scene: Scene) -> int:

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint
 from recon_cli.render import render
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
@@ -33,7 +33,7 @@ _MAX_NEARER = 3.0  # natural logarithm of how much nearer a camera may be than a
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class ViewingGeometry:
     """How N Gaussians look from one place, compared with where training saw them from."""
 
     angle: Tensor  # [N] rad to the nearest ray of a training view that shows it; pi without any
@@ -74,7 +74,7 @@ class _Rays:
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
+class ViewSupport:
     """The support of N Gaussians in the training views."""
 
     rows: tuple[Tensor, ...]  # by view the Gaussians that it shows, [K] int64
@@ -87,16 +87,16 @@ class Support:
     @staticmethod
     def from_rows(
         rows: Sequence[Tensor], centers: NDArray[np.float64], residual: Tensor, digest: str = ""
-    ) -> Support:
+    ) -> ViewSupport:
         """Returns the support by `rows`, with the views of each Gaussian counted."""
         count = torch.zeros(len(residual), dtype=torch.int64, device=residual.device)
         for shown in rows:
             count[shown] += 1
-        return Support(tuple(rows), centers, residual, count, digest)
+        return ViewSupport(tuple(rows), centers, residual, count, digest)
 
-    def to(self, device: torch.device) -> Support:
+    def to(self, device: torch.device) -> ViewSupport:
         """Returns the same on a device."""
-        return Support(tuple(rows.to(device) for rows in self.rows), self.centers,
+        return ViewSupport(tuple(rows.to(device) for rows in self.rows), self.centers,
                        self.residual.to(device), self.count.to(device), self.digest)
 
     def span(self, means: Tensor) -> Tensor:
@@ -109,13 +109,13 @@ class Support:
         cosine = rays.reduce("min", rays.cosines(middle))
         return 2 * torch.arccos(cosine.clamp(-1, 1)) * (self.count > 1)
 
-    def seen_from(self, means: Tensor, place: NDArray[np.float64]) -> Sight:
+    def seen_from(self, means: Tensor, place: NDArray[np.float64]) -> ViewingGeometry:
         """Returns how Gaussians at `means` [N, 3] look from `place` [3]."""
         rays, (toward, distance) = self._rays(means), _directions(means, place)
         seen = self.count > 0
         cosine = rays.reduce("max", rays.cosines(toward)).clamp(-1, 1)
         nearer = torch.log(rays.nearest / distance).clamp(0, _MAX_NEARER)
-        return Sight(torch.arccos(torch.where(seen, cosine, -1.0)),
+        return ViewingGeometry(torch.arccos(torch.where(seen, cosine, -1.0)),
                      torch.where(seen, nearer, 0.0))
 
     def _rays(self, means: Tensor) -> _Rays:
@@ -138,7 +138,7 @@ class Support:
                       temporary, metadata={"support": json.dumps(head)})
 
     @staticmethod
-    def load(path: Path) -> Support:
+    def load(path: Path) -> ViewSupport:
         """Reads the file that `save` wrote; FormatError if it is missing, damaged or of another."""
         refuse_special(path)
         try:
@@ -152,9 +152,9 @@ class Support:
             bits = np.unpackbits(shown.numpy(), axis=1, count=count)
         except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
             raise FormatError(
-                f"{path} cannot be read: {error}.", hint="Run `recon eval --again`.") from error
+                f"{path} cannot be read: {error}.", hint=Hint("eval", again=True)) from error
         rows = tuple(torch.from_numpy(np.nonzero(row)[0]) for row in bits)
-        return Support.from_rows(rows, centers.numpy(), residual, str(head["digest"]))
+        return ViewSupport.from_rows(rows, centers.numpy(), residual, str(head["digest"]))
 
 
 def _directions(means: Tensor, place: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
@@ -168,7 +168,7 @@ def measure_support(
     splats: Splats, views: Iterable[TrainView], *, sh_degree: int, backend: str,
     gains: bool = False, on_view: Callable[[], None] = lambda: None,
     digest: str = "",
-) -> Support:
+) -> ViewSupport:
     """Returns the support of the Gaussians in the training views, by one forward pass over them.
 
     `gains` compares after the best gain per channel, as where exposures were trained.
@@ -199,7 +199,7 @@ def measure_support(
         on_view()
     mean = float(errors.sum() / weights.sum().clamp_min(1e-12))
     residual = torch.where(weights > 0, errors / weights.clamp_min(1e-12), mean)
-    return Support.from_rows(
+    return ViewSupport.from_rows(
         shown, np.reshape(centers, (-1, 3)), residual.to(splats.means.dtype), digest)
 
 
@@ -225,10 +225,7 @@ def error_image(
 
 def _pixels(means: Tensor, view: TrainView) -> tuple[Tensor, Tensor]:
     """Returns line and column [K] of the pixels that centres [K, 3] fall on, on the CPU."""
-    camera = view.camera
-    local = means.detach().cpu().double().numpy() @ camera.viewmat[:3, :3].T + (
-        camera.viewmat[:3, 3])
-    depth = np.maximum(local[:, 2], 1e-9)
-    u = np.floor(camera.fx * local[:, 0] / depth + camera.cx).clip(0, camera.width - 1)
-    v = np.floor(camera.fy * local[:, 1] / depth + camera.cy).clip(0, camera.height - 1)
-    return torch.from_numpy(v.astype(np.int64)), torch.from_numpy(u.astype(np.int64))
+    pixels, _ = view.camera.project(means.detach().cpu().double().numpy())
+    last = view.camera.width - 1, view.camera.height - 1
+    column, line = torch.from_numpy(np.nan_to_num(pixels).clip(0, last)).long().unbind(1)
+    return line, column

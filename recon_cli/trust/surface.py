@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.scene.splats import Splats
-from recon_cli.trust.support import Support
+from recon_cli.splats.ply import MIN_OPACITY
+from recon_cli.trust.support import ViewSupport
 from recon_cli.workspace.summaries import JsonRecord
 
-OPAQUE = 0.5  # opacity from which a Gaussian is a surface
 MIN_VIEWS = 3  # two views agree on much that is wrong
 MIN_SPAN_DEG = 10.0  # below, depth hangs on a fraction of a pixel
 # Median distances from the middle beyond which a surface is outside, as through a window. The
@@ -31,9 +31,9 @@ class SurfaceShares(JsonRecord):
     cells: int  # of the surface
 
 
-def surface_rows(splats: Splats, support: Support) -> torch.Tensor:
+def surface_rows(splats: Splats, support: ViewSupport) -> torch.Tensor:
     """Returns rows [K] of the Gaussians that are the surface of the room, seen by a view."""
-    drawn = (splats.opacities >= OPAQUE) & (support.count > 0)
+    drawn = (splats.opacities >= MIN_OPACITY) & (support.count > 0)
     drawn &= torch.isfinite(splats.means).all(1)
     rows = torch.nonzero(drawn)[:, 0]
     if not len(rows):
@@ -64,7 +64,7 @@ class SurfaceCells:
     narrow: NDArray[np.float64]  # [C] share that views show from one direction
 
 
-def find_cells(splats: Splats, support: Support) -> SurfaceCells:
+def find_cells(splats: Splats, support: ViewSupport) -> SurfaceCells:
     """Returns the cells of the surface; none where no view shows any."""
     rows = surface_rows(splats, support)
     views = support.count[rows].cpu().numpy()

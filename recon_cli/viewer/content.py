@@ -30,7 +30,7 @@ from recon_cli.splats.html import find_title
 from recon_cli.splats.ply import read_ply
 from recon_cli.splats.registry import read_splats
 from recon_cli.train.masks import read_summary
-from recon_cli.viewer.gaussians import PackedSplats, pack_splats
+from recon_cli.viewer.gaussians import PackedGaussians, pack_splats
 from recon_cli.viewer.keyframes import PathFolder
 
 HELD_OUT, TRAINING, VALIDATION = "held-out", "training", "validation"
@@ -73,7 +73,7 @@ class LabeledView:
 class ViewerContent:
     """Everything that browsers can show."""
 
-    models: Mapping[str, PackedSplats]  # by name, the initial one first
+    models: Mapping[str, PackedGaussians]  # by name, the initial one first
     views: tuple[LabeledView, ...]  # held-out first; none for a file or an import without views
     up: NDArray[np.float64] | None  # [3] unit vector; None where unknown
     start: BrowserCamera
@@ -139,7 +139,7 @@ def load_file(path: Path) -> ViewerContent:
         PathFolder(Path(), None))
 
 
-def _far_plane(models: Mapping[str, PackedSplats]) -> float:
+def _far_plane(models: Mapping[str, PackedGaussians]) -> float:
     """Returns a distance beyond all Gaussians."""
     reach = [float(model.splats.means.norm(dim=1).max()) if len(model.splats) else 0.0
              for model in models.values()]

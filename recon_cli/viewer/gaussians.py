@@ -27,7 +27,7 @@ _THINNEST = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class PackedSplats:
+class PackedGaussians:
     """N Gaussians as they are sent."""
 
     splats: Splats  # on the CPU, finite
@@ -46,7 +46,7 @@ class PackedSplats:
         return _eight_bit(rgb.numpy())
 
 
-def pack_splats(splats: Splats) -> PackedSplats:
+def pack_splats(splats: Splats) -> PackedGaussians:
     """Packs Gaussians of any device, without those that are not finite, which nothing renders."""
     splats = _drop_non_finite(splats.map(lambda tensor: tensor.detach().cpu()))
     scales = np.exp(splats.log_scales.numpy().astype(np.float64))
@@ -57,7 +57,7 @@ def pack_splats(splats: Splats) -> PackedSplats:
     spread = np.clip(scales, _THINNEST * longest[:, None], None).clip(max=largest) / scale
     rotations = rotation_matrices(splats.quats.double()).numpy()
     factors = rotations * spread[:, None, :]
-    return PackedSplats(
+    return PackedGaussians(
         splats, scale, (splats.means.numpy() / scale).astype(np.float32),
         (factors @ factors.transpose(0, 2, 1)).astype(np.float16),
         _eight_bit(splats.opacities.numpy())[:, None])

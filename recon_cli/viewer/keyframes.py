@@ -16,14 +16,14 @@ from viser.transforms import SO3
 
 from recon_cli.errors import ReconError, WorkspaceError
 from recon_cli.flythrough.camera_path import CameraPath, write_camera_path
+from recon_cli.flythrough.request import FPS
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.camera_paths import keyframe_path
 
-FPS = 30.0  # of the file, as that of `recon render`
 SIZE = (1280, 720)  # of the file, where there is no capture whose shape it could have
 _PREVIEW_FPS = 20.0  # browsers move smoothly, and a slow connection keeps up
 _SECONDS = 4.0  # from keyframe to keyframe, at first
-_LEAST_MOVE = 1e-3  # of the distance to the target, and radians: nearer keyframes are the same
+LEAST_MOVE = 1e-3  # of the distance to the target, and radians: nearer keyframes are the same
 _FILES = 999  # paths in one folder, at most
 _COLOR = (255, 200, 60)
 
@@ -104,7 +104,7 @@ class KeyframePanel:
         viewmat[:3, 3] = -viewmat[:3, :3] @ camera.position
         with self._lock:
             if self._viewmats and np.allclose(
-                    self._scaled(viewmat), self._scaled(self._viewmats[-1]), atol=_LEAST_MOVE):
+                    self._scaled(viewmat), self._scaled(self._viewmats[-1]), atol=LEAST_MOVE):
                 self._text.content = "Move the camera first: it is where the last keyframe is."
                 return
             self._viewmats.append(viewmat)

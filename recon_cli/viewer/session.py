@@ -27,8 +27,8 @@ from recon_cli.viewer.content import (
     move_browser,
     vertical_fov,
 )
-from recon_cli.viewer.gaussians import PackedSplats, show_backdrop
-from recon_cli.viewer.keyframes import KeyframePanel
+from recon_cli.viewer.gaussians import PackedGaussians, show_backdrop
+from recon_cli.viewer.keyframes import LEAST_MOVE, KeyframePanel
 from recon_cli.viewer.measure_panel import MeasurePanel
 from recon_cli.viewer.trust_tint import TrustTint
 
@@ -38,7 +38,6 @@ NO_VIEW = "none"
 UPS = {"+z": (0, 0, 1), "-y": (0, -1, 0), "+y": (0, 1, 0), "-z": (0, 0, -1), "+x": (1, 0, 0),
        "-x": (-1, 0, 0)}  # recon's own first, then COLMAP's usual one
 _REST_SECONDS = 0.25  # a camera that has not moved for this long has stopped
-_MOVED = 1e-3  # of the distance to the camera's target; smaller moves keep the colours
 _BOX_COLOR = (255, 170, 0)
 
 logger = logging.getLogger("recon")
@@ -81,7 +80,7 @@ class Session:
         self._path.stop()
 
     @property
-    def _packed(self) -> PackedSplats:
+    def _packed(self) -> PackedGaussians:
         return self._content.models[self._model]
 
     def _add_gaussians(self) -> viser.GaussianSplatHandle:
@@ -240,7 +239,7 @@ class Session:
         with self._lock:
             position = np.asarray(self._client.camera.position)
             far = self._seen_from is None or bool(
-                np.linalg.norm(position - self._seen_from) > _MOVED * self._content.distance)
+                np.linalg.norm(position - self._seen_from) > LEAST_MOVE * self._content.distance)
             if far and len(self._rows):
                 self._seen_from = position
                 self._node.rgbs = self._colors(position.tolist())[self._rows]

@@ -14,7 +14,7 @@ from recon_cli.flythrough.trained_scene import open_trained_scene
 from recon_cli.pipeline.execute import Job, render_context
 from recon_cli.trust.heat_map import tint
 from recon_cli.trust.scene_trust import Trust
-from recon_cli.viewer.gaussians import PackedSplats, finite_rows
+from recon_cli.viewer.gaussians import PackedGaussians, finite_rows
 
 
 class TrustTint:
@@ -38,7 +38,7 @@ class TrustTint:
                 trust.support.to(trained.splats.means.device), trust.error, trust.sh_degree), rows)
 
     def colors(
-        self, model: str, packed: PackedSplats, colors: NDArray[np.uint8], place: Sequence[float]
+        self, model: str, packed: PackedGaussians, colors: NDArray[np.uint8], place: Sequence[float]
     ) -> NDArray[np.uint8]:
         """Returns colours [N, 3] tinted by the trust of a prepared model as seen from a place."""
         trust, rows = self._trusts[model]

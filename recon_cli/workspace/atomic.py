@@ -1,6 +1,6 @@
 """Files that are either complete or absent: written beside, flushed, then renamed into place.
 
-Of unfinished work each gets a digest as well, see `journal`. Here is also the one reader of JSON.
+Of unfinished work each gets a digest as well, see `steps`. Here is also the one reader of JSON.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from recon_cli.errors import FormatError
-from recon_cli.workspace import durable, journal
+from recon_cli.errors import FormatError, Hint
+from recon_cli.workspace import durable, steps
 from recon_cli.workspace.paths import describe_special
 
 MAX_TEXT_BYTES = 256 << 20  # of a JSON or TOML file; parsing takes some twenty times as much memory
@@ -37,10 +37,10 @@ def replacing(path: Path) -> Iterator[Path]:
         _share(temporary)
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        journal.make_way(path)
-        journal.expect(path, temporary)
+        steps.make_way(path)
+        steps.expect(path, temporary)
         durable.replace(temporary, path)
-        journal.confirm(path)
+        steps.confirm(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -67,7 +67,7 @@ def _share(path: Path) -> None:
 def delete(path: Path) -> None:
     """Deletes a file of unfinished work, if it is there, so that a next run does not miss it."""
     if os.path.lexists(path):
-        journal.expect_removal(path)
+        steps.expect_removal(path)
         path.unlink()
 
 
@@ -88,7 +88,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(
-    path: Path, kind: type | None = None, *, hint: str = "", finite: bool = True
+    path: Path, kind: type | None = None, *, hint: str | Hint = "", finite: bool = True
 ) -> Any:
     """Returns the value in a JSON file, of a `kind` (dict or list) if that is given.
 

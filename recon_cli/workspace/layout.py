@@ -27,7 +27,7 @@ import psutil
 from filelock import FileLock, Timeout
 
 from recon_cli.errors import FormatError, ManifestError, ReconError, WorkspaceError
-from recon_cli.workspace import disk, durable, journal, manifest, shared_folder
+from recon_cli.workspace import disk, durable, manifest, shared_folder, steps
 from recon_cli.workspace.atomic import LEFTOVERS, clear_leftovers, read_json, sync_folder
 from recon_cli.workspace.digests import FileDigest, digest_file
 from recon_cli.workspace.manifest import (
@@ -47,6 +47,7 @@ BLOCKS = "blocks"  # workspaces that `recon train --blocks` made before it was o
 SEEDS = "seeds"  # workspaces of other seeds that earlier versions made
 RENDERS = "render"  # folders of `recon render`, whose frames are kept to resume
 _OLD = ".old"  # results that were replaced
+_OLD_LOG = "steps.json"  # of the steps of earlier versions, in a stage's folder
 
 logger = logging.getLogger("recon")
 
@@ -78,13 +79,13 @@ class Workspace:
 
     def partial(self, stage: str) -> Path:
         """Returns where a stage writes before it is finished."""
-        return self.root / journal.PARTIAL / stage
+        return self.root / steps.PARTIAL / stage
 
     def _old(self, stage: str) -> Path:
         return self.root / _OLD / stage
 
     def _record(self, stage: str) -> Path:
-        return self.root / journal.PARTIAL / f"{stage}.json"
+        return self.root / steps.PARTIAL / f"{stage}.json"
 
     @contextmanager
     def writing(self, verb: str) -> Iterator[None]:
@@ -113,7 +114,7 @@ class Workspace:
         """Removes the folders that a failed first command made, unless there is work in them."""
         with suppress(OSError):  # somebody has put a file there meanwhile
             with suppress(FileNotFoundError):
-                (self.root / journal.PARTIAL).rmdir()
+                (self.root / steps.PARTIAL).rmdir()
             if {path.name for path in self.root.iterdir()} <= {LOG, LOCK, HOLDER}:
                 for name in (LOG, LOCK, HOLDER):
                     (self.root / name).unlink(missing_ok=True)
@@ -156,7 +157,7 @@ class Workspace:
             progress = describe_progress(earlier.done, earlier.total)
             logger.info("%s: resuming (%s)", key.stage, progress)
             clear_leftovers(partial)
-            journal.remove_strange(partial)
+            steps.remove_strange(partial)
             return partial, earlier
         if doubt:
             logger.warning("%s: unfinished work is discarded: %s", key.stage, doubt)
@@ -164,7 +165,7 @@ class Workspace:
         fresh = PartialRun(key)
         partial.mkdir(parents=True)
         if not own_digests:
-            journal.start(partial)
+            steps.start(partial)
         fresh.write(self._record(key.stage))
         return partial, fresh
 
@@ -176,7 +177,10 @@ class Workspace:
                 os.path.lexists(partial))
         if earlier.key.fingerprint != key.fingerprint:
             return "it has other settings or inputs"
-        return "" if own_digests else journal.find_damage(partial)
+        if own_digests:
+            old = (partial / _OLD_LOG).exists()
+            return "an earlier version of recon left it" * old
+        return steps.find_damage(partial)
 
     def record(self, partial_run: PartialRun) -> None:
         """Writes how much of a run would survive a crash."""
@@ -184,14 +188,14 @@ class Workspace:
 
     def discard(self, stage: str) -> None:
         """Removes unfinished work of a stage."""
-        holder = self.root / journal.PARTIAL
+        holder = self.root / steps.PARTIAL
         if holder.is_symlink() and not self.partial_run(stage):
             holder.unlink()  # it may point to anything
             return
         # The record goes first: without it the rest counts for nothing.
         remove(self._record(stage))
         remove(self.partial(stage))
-        remove(journal.journal_path(self.partial(stage)))
+        remove(steps.log_path(self.partial(stage)))
 
     def seal(self, stage: str) -> dict[str, FileDigest]:
         """Flushes a stage's files and returns the digest of each, by relative path."""
@@ -225,7 +229,7 @@ class Workspace:
         sync_folder(self.root)
         sync_folder(partial.parent)
         remove(self._record(stage))
-        remove(journal.journal_path(partial))
+        remove(steps.log_path(partial))
         remove(self._old(stage))
 
     def _retire(self, stage: str) -> None:
@@ -247,12 +251,12 @@ class Workspace:
 
     def recover(self) -> None:
         """Completes or undoes work interrupted by a crash, stage by stage."""
-        for name in (journal.PARTIAL, _OLD):
+        for name in (steps.PARTIAL, _OLD):
             path = self.root / name
             if (path.is_symlink() and name == _OLD) or (
                     os.path.lexists(path) and not path.is_dir()):
                 path.unlink()
-        for partial in _folders(self.root / journal.PARTIAL):
+        for partial in _folders(self.root / steps.PARTIAL):
             if not self._record(partial.name).is_file() or not _complete(partial):
                 continue
             damage = (shared_folder.find_damage(partial, self._target(partial.name))
@@ -292,7 +296,7 @@ class Workspace:
 
         Where one of these folders is a link, that is the link, not its target.
         """
-        parents = [self.root / name for name in (journal.PARTIAL, _OLD, SEEDS, BLOCKS)]
+        parents = [self.root / name for name in (steps.PARTIAL, _OLD, SEEDS, BLOCKS)]
         return [*(path for parent in parents
                   for path in ([parent] if parent.is_symlink() else sorted(parent.glob("*")))),
                 *(path for path in sorted(self.root.glob(LEFTOVERS)) if not _is_in_use(path))]

@@ -13,6 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from recon_cli.errors import FormatError, ManifestError, list_names
+from recon_cli.errors import FormatError, Hint, ManifestError, list_names, name_command
 from recon_cli.scene.camera import Lens, make_lens, panorama_lens
 from recon_cli.workspace import atomic
 from recon_cli.workspace.json_record import JsonRecord
@@ -29,11 +30,24 @@ from recon_cli.workspace.json_record import JsonRecord
 # A frame in a sentence, but not in a path
 _FRAME_NAME = re.compile(r"(?<![\w./\\-])[\w.-]+\.png\b")
 FOLDER, MASKS, LIST = "frames", "masks", "frames.json"
-AGAIN = "Run `recon ingest --again`."
+AGAIN = Hint("ingest", again=True)
 POSES, POINTS = "poses.json", "points.safetensors"
 _IMPORT = "import.json"
-NEEDS_VIEWS_HINT = (
-    "Run `recon ingest CAPTURE` and `recon sfm` in this workspace, then `recon import` again.")
+MIN_FRAMES = 3  # of a scene: two cameras have no third one to contradict them
+
+
+def need_views() -> str:
+    """Returns the commands that give an imported scene views."""
+    return (f"Run {name_command('ingest CAPTURE')} and {name_command('sfm')} in this workspace, "
+            f"then {name_command('import')} again.")
+
+
+class Confidence(IntEnum):
+    """Levels of confidence of a sensor's depth."""
+
+    LOW = 0
+    MEDIUM = 1
+    HIGH = 2
 
 
 @dataclass(frozen=True)
@@ -130,7 +144,7 @@ def refuse_missing_frames(folder: Path, names: Collection[str], verb: str) -> No
     if missing:
         raise FormatError(
             f"{folder} lacks {len(missing)} of {len(names)} frames: {list_names(missing)}.",
-            hint=f"Run `recon {verb} --again`.")
+            hint=Hint(verb, again=True))
 
 
 def find_frames(ingest: Path, words: Sequence[str]) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from recon_cli.errors import FormatError
+from recon_cli.errors import FormatError, Hint, name_command
 from recon_cli.workspace.atomic import parse_json, read_json, read_text
 from recon_cli.workspace.json_record import KEY
 from recon_cli.workspace.json_record import JsonRecord as JsonRecord  # whoever reads a record
@@ -121,7 +121,7 @@ class WorldSummary(JsonRecord):
             FormatError: it is damaged.
         """
         path = place / cls.FILE
-        hint = "Run `recon sfm --again`."
+        hint = Hint("sfm", again=True)
         return cls.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
 
 
@@ -239,7 +239,7 @@ class TrainPlan(JsonRecord):
             ManifestError: the file is of another version.
             FormatError: it is missing or damaged.
         """
-        return cls.from_json(read_json(train / cls.FILE, dict, hint="Run `recon train --again`."))
+        return cls.from_json(read_json(train / cls.FILE, dict, hint=Hint("train", again=True)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +270,7 @@ class LogRow(JsonRecord):
                       for line in lines if line.endswith("\n")]
         except (OSError, ValueError) as error:
             raise FormatError(f"{log} is damaged: {error}.",
-                              hint=f"Run `recon {log.parent.name} --again`.") from error
+                              hint=f"Run {name_command(f'{log.parent.name} --again')}.") from error
         return tuple(map(cls.from_json, values))
 
 
@@ -330,7 +330,7 @@ class PhotometrySummary(JsonRecord):
             FormatError: it is damaged.
         """
         path = folder / cls.FILE
-        hint = "Run `recon train --again`."
+        hint = Hint("train", again=True)
         return cls.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
 
 

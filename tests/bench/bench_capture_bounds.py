@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from workbench import FOLDER
 
+from recon_cli.capture.limits import TRACK_SIZE
 from recon_cli.capture.panoramas import wraps_around
 from recon_cli.capture.repeats import SAME_PICTURE, measure_shift
-from recon_cli.capture.tracker import TRACK_SIZE, Tracker
+from recon_cli.capture.tracker import Tracker
 from recon_cli.io.tracks import Tracks
 
 PICTURES = 30

@@ -259,7 +259,7 @@ def test_what_is_left_out_is_named():
 def test_many_names_are_cut_short():
     pictures = {"a": photo(1), "b": photo(2), "c": photo(3)} | {
         f"copy{index}": photo(1) for index in range(12)}
-    assert describe_dropped(choose(pictures))[0].endswith("and 4 more.")
+    assert describe_dropped(choose(pictures))[0].endswith("and 7 more.")
 
 
 @pytest.mark.parametrize("count", [3, 12])

@@ -39,7 +39,7 @@ def write_photos(folder, grays, *, name="frame_{:04d}.jpg", turned=False):
 
 
 def found(photos, tmp_path):
-    return find_sequence(photos, tmp_path / "sequence.json", StageContext())
+    return find_sequence(photos, tmp_path / "scan.json", StageContext())
 
 
 def named(*names, **changes):
@@ -189,6 +189,6 @@ def test_a_sequence_comes_back_from_its_record_for_the_same_photos(tmp_path, mon
     np.testing.assert_array_equal(again.scan.tracks.xy, first.scan.tracks.xy)
     assert not scans
     assert found(photos[1:], tmp_path) is None
-    (tmp_path / "sequence.json").write_text("{}")
+    (tmp_path / "scan.json").write_text("{}")
     assert found(photos, tmp_path) is None
     assert len(scans) == 2

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from media import texture
 
-from recon_cli.capture.tracker import CELL, TRACK_SIZE, Tracker, find_corners
+from recon_cli.capture.limits import TRACK_SIZE
+from recon_cli.capture.tracker import CELL, Tracker, find_corners
 
 pytestmark = pytest.mark.floors
 

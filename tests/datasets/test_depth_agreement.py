@@ -59,6 +59,16 @@ def test_depth_in_another_unit_is_used_in_the_one_that_fits(taken, own, read):
     assert not fit.fault
 
 
+def test_depth_of_a_lens_with_one_focal_length_is_looked_up_where_it_lies(taken):
+    images = []
+    for image in posed(taken, lambda metres: metres * 5):  # in 1/5000 m, read in 1/1000 m
+        fx, _, cx, cy = image.lens.params
+        lens = Lens("SIMPLE_RADIAL", image.lens.width, image.lens.height, (fx, cx, cy, 0.0))
+        images.append(dataclasses.replace(
+            image, lens=lens, depth=dataclasses.replace(image.depth, lens=lens)))
+    assert fit_depth(images).factor == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize(("scale", "noise"), [(1, 0.01), (1.05, 0.01), (0.95, 0.01), (1, 0.08)])
 def test_depth_that_fits_by_a_tenth_stays_as_it_is(taken, scale, noise):
     fit = fit_depth(posed(taken, lambda depth: depth * scale, noise=noise))

@@ -16,9 +16,8 @@ from recon_cli.experiments import runner
 from recon_cli.experiments.runner import (
     RECORDS_FILE,
     CurvePoint,
-    Record,
-    Records,
     key_of,
+    open_records,
     run_trial,
 )
 from recon_cli.experiments.scenes import SceneFolders, load_for_training
@@ -78,7 +77,7 @@ def work(folder, seeds=2, **changes):
     folder.mkdir(exist_ok=True)
     request = StudyRequest(
         scenes=(), seeds=seeds, iterations=STEPS, base=BASE, out=folder, **changes)
-    return Study(request, Records(folder), NullProgress(), "a machine")
+    return Study(request, open_records(folder), NullProgress(), "a machine")
 
 
 # ---- equal seconds ----
@@ -138,7 +137,7 @@ def test_the_seconds_that_are_made_equal_can_be_chosen(scene, made, tmp_path):
         work(tmp_path / "out", seeds=1, clock=clock).run_scene(scene)
     assert len(made) == 7  # the same ratios: steps are fixed anew, runs are taken again
     lines = (tmp_path / "out" / RECORDS_FILE).read_text().splitlines()
-    assert sum("steps" in json.loads(line)["value"] for line in lines) == 2
+    assert sum("steps" in json.loads(line)["result"] for line in lines) == 2
 
 
 # ---- resuming ----
@@ -192,7 +191,7 @@ def test_a_line_that_a_kill_cut_short_is_dropped(scene, made, tmp_path):
 def test_a_line_that_is_damaged_inside_is_refused(tmp_path):
     (tmp_path / RECORDS_FILE).write_text("{}\n")
     with pytest.raises(FormatError, match="line 1"):
-        Records(tmp_path)
+        open_records(tmp_path)
 
 
 def test_a_key_tells_everything_apart_that_decides(scene, monkeypatch):
@@ -212,14 +211,6 @@ def test_a_key_tells_everything_apart_that_decides(scene, monkeypatch):
     monkeypatch.undo()
     threads = dataclasses.replace(scene, ctx=StageContext(backend="numba", threads=9))
     assert key_of(threads, run) == key_of(scene, run)
-
-
-def test_a_record_comes_back_as_it_was(tmp_path):
-    point = CurvePoint(1, 2.0, 3.0, 4, 5, 6.789, 0.123)
-    record = Record((point,), "a machine", "original images, far")
-    Records(tmp_path).add_run("key", record, TrainingRun(VARIANTS[0], BASE, 1, 0), "tiny")
-    assert Records(tmp_path).run("key") == record
-    assert Records(tmp_path).run("other") is None
 
 
 def test_the_arms_are_those_of_the_paper_and_ours():

@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 
 from recon_cli.export.camera_files import _as_seen
-from recon_cli.io.colmap import project, write_priors
-from recon_cli.io.depth_maps import write_depth
+from recon_cli.io.colmap import write_priors
+from recon_cli.io.depth_maps import lens_camera, write_depth
 from recon_cli.scene.camera import Camera, Lens
 
 
@@ -55,7 +55,7 @@ def test_pixels_beyond_the_depth_are_unknown(tmp_path):
 def test_a_distorted_lens_is_followed():
     k1 = -0.1
     lens = Lens("OPENCV", 100, 80, (90.0, 90.0, 50.0, 40.0, k1, 0.0, 0.0, 0.0))
-    (at,) = project(lens, np.array([[0.3, 0.1, 1.0]]))
+    (at,) = lens_camera(lens).img_from_cam(np.array([[0.3, 0.1, 1.0]]))
     scale = 1 + k1 * (0.3**2 + 0.1**2)
     assert at == pytest.approx([90 * 0.3 * scale + 50, 90 * 0.1 * scale + 40])
 

@@ -14,7 +14,8 @@ from recon_cli.stages import STAGES
 
 VOLATILE = {row.name: row.volatile for row in STAGES}
 # Files that hold times beside results; of JSON the rest is compared.
-_TIMED = ("*/manifest.json", "evaluate/metrics.*", "evaluate/table.txt", "render/*/render.json")
+_TIMED = ("*/manifest.json", "evaluate/metrics.*", "evaluate/table.txt", "render/*/render.json",
+          "render/*/steps.jsonl")
 _MINUTE = re.compile(rb"report, \d{4}-\d\d-\d\d \d\d:\d\d")
 _TIMES = {"render_ms", "train_seconds", "seconds", "cpu_seconds"}
 

@@ -65,7 +65,7 @@ def test_the_inner_camera_is_read_unchanged(undistorted):
 def test_each_view_has_its_inner_camera_by_name(undistorted):
     pinholes = read_pinholes(undistorted / "sparse")
     assert sorted(pinholes) == NAMES
-    assert all(one.fy == 5.5 for one in pinholes.values())
+    assert all(one.params[1] == 5.5 for one in pinholes.values())
 
 
 def test_a_turned_camera_looks_where_its_quaternion_says(undistorted):

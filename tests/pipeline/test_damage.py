@@ -147,11 +147,11 @@ def test_jobs_of_a_stage_keep_digests_of_their_own_and_stay(
             bring(job, "train")
     shared = job.workspace.partial("train") / "jobs" / "0"
     shared.mkdir(parents=True)
-    journal = job.workspace.root / ".partial" / "train.digests"
-    before = journal.read_bytes()
+    log = job.workspace.root / ".partial" / "train.steps"
+    before = log.read_bytes()
     write_bytes(shared / "result.txt", b"of a job")
     (shared / "log.txt").write_text("written as any program does")
-    assert journal.read_bytes() == before
+    assert log.read_bytes() == before
     (job.workspace.partial("train") / "strange.txt").write_text("of nobody")
     bring(job, "train")
     kept = job.workspace.folder("train")

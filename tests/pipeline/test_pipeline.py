@@ -67,10 +67,10 @@ def test_the_command_to_type_is_one_that_the_shell_and_the_verb_take(job: Job) -
     changes["sfm"]["max_features"] = 500
     bring(job, "denoise", "sfm", "place", changes=changes)
     look = job.inspect()
-    assert plan.command(look, look.check("denoise")) == "recon denoise --off"
+    assert plan.command(look, look.check("denoise")) == "denoise --off"
     for name in ("sfm", "place"):  # which are one verb, with the options of both
         assert plan.command(look, look.check(name)) == (
-            "recon sfm --max-features 500 --scale-between 'my frame.png' b.png 1.5")
+            "sfm --max-features 500 --scale-between 'my frame.png' b.png 1.5")
 
 
 def test_a_stage_keeps_the_options_it_was_made_with_when_others_need_it(job: Job) -> None:

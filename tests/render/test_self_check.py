@@ -11,7 +11,7 @@ from recon_cli.errors import BackendError
 from recon_cli.render import self_check
 from recon_cli.render.self_check import (
     BackendCandidate,
-    StepResult,
+    StepOutcome,
     Verdict,
     check,
     numba_candidate,
@@ -111,7 +111,7 @@ def wrong_gradient(result):
 
 def wrong_adam(result):
     moved = result.moved.map(lambda tensor: tensor + 2e-5)
-    return StepResult(result.loss, result.gradients, moved)
+    return StepOutcome(result.loss, result.gradients, moved)
 
 
 def no_number(result):

@@ -71,8 +71,9 @@ def test_the_scale_bar_is_as_long_as_it_says():
     room = scene(ROUND)
     axes = find_axes(room, z_up=True)
     svg = draw_plan(room, axes, metres=True)
-    length, text = re.search(r'axis scale" d="M[\d.]+,\d+v6h([\d.]+)v-6"/>.*?>([\d.]+) m<', svg,
-                             re.DOTALL).groups()
+    length, text = re.search(
+        r'd="M[\d.]+,[\d.]+v6h([\d.]+)v-6" class="axis scale"/>.*?>([\d.]+) m<', svg,
+        re.DOTALL).groups()
     (ex, _), _ = drawn(svg, "e.png")
     (wx, _), _ = drawn(svg, "w.png")
     assert float(length) / float(text) == pytest.approx((ex - wx) / 4, abs=0.1)

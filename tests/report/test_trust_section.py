@@ -1,6 +1,7 @@
 """The section on trust, and the numbers on the plan."""
 
 import json
+import re
 
 import numpy as np
 from report_workspace import page_of, section
@@ -62,7 +63,6 @@ def test_a_region_off_the_path_fits_into_the_plan(workspace):
         workspace / "place" / "undistorted", held_out=frozenset(), validation=0.0)
     far = PoorlySeenRegion(**{**vars(REGION), "position": (30.0, -20.0, 1.0)})
     plan = str(draw_plan(scene, find_axes(scene, z_up=True), metres=False, regions=[far]))
-    texts = plan.split('class="next" x="')[1]
-    x = float(texts.split('"')[0])
+    x = float(re.search(r'<text x="([-\d.]+)"[^>]* class="next"', plan)[1])
     assert 0 < x < 640
     assert np.isfinite(x)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from recon_cli.errors import ConfigError
-from recon_cli.io.colmap import Pinhole
 from recon_cli.room.scale import Place, ScaleBetween, measure, parse_place
+from recon_cli.scene.camera import Lens
 
 NAMES = ("000001.png", "000002.png", "IMG 7.jpg", "twin.jpg", "twin.png")
-PINHOLE = Pinhole(600, 400, 300.0, 300.0, 300.0, 200.0)
+PINHOLE = Lens("PINHOLE", 600, 400, (300.0, 300.0, 300.0, 200.0))
 
 
 @pytest.mark.parametrize(("text", "place"), [

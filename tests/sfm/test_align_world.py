@@ -9,19 +9,24 @@ import numpy as np
 import pycolmap
 import pytest
 from rooms import degrees_between, make_room
+from scipy.spatial.transform import Rotation
+from synthetic import make_capture
 from test_similarity import random_similarity
 
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.scene.similarity import Similarity
+from recon_cli.sfm.mapping.parts import write_parts
 from recon_cli.sfm.poses.align_world import WorldFrame, refuse_contradiction, world_transform
 from recon_cli.sfm.segments.shared_points import to_sim3d
+from recon_cli.sfm.views import undistort
 
 
 def world_of(room, *, gravity=True, between=None, metric=False) -> WorldFrame:
     return world_transform(
-        room.points, room.named(), gravity=gravity, scale_between=between, metric=metric)
+        room.points, room.named(), level_views=room.viewmats if gravity else None,
+        scale_between=between, metric=metric)
 
 
 def distance(room, a: str, b: str) -> float:
@@ -105,8 +110,8 @@ def test_sources_of_which_none_can_be_chosen_end_it_unless_that_is_accepted():
     sources = [ScaleSource("the tracked poses", 1.0, 0.003), ScaleSource("sensor depth", 10, 0.005)]
 
     def world(chosen, between=None):
-        return world_transform(room.points, room.named(), gravity=True, scale_between=between,
-                               metric=True, sources=chosen)
+        return world_transform(room.points, room.named(), level_views=room.viewmats,
+                               scale_between=between, metric=True, sources=chosen)
 
     evidence = world(sources).evidence
     assert not evidence.metres
@@ -128,6 +133,31 @@ def test_a_room_without_a_floor_says_so():
     assert "no floor is seen" in world.sentences[0]
 
 
+@pytest.mark.parametrize(("lean_deg", "found"), [(0.5, True), (25.0, False)])
+def test_level_panoramas_that_face_one_way_show_up_without_a_floor(tmp_path, monkeypatch, lean_deg,
+                                                                   found):
+    rng = np.random.default_rng(0)
+    world = Rotation.from_euler("xz", [70, 20], degrees=True)  # the mapper's frame
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera(
+        camera_id=1, model="EQUIRECTANGULAR", width=512, height=256, params=(512, 256)))
+    for number in range(1, 9):
+        lean = Rotation.from_rotvec(np.radians(lean_deg) * rng.normal(size=3))
+        turn, center = (lean * world).as_matrix(), rng.normal(size=3)
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(image_id=number, name=f"{number}.png", camera_id=1),
+            pycolmap.Rigid3d(np.column_stack([turn, -turn @ center])))
+    for place in rng.normal(size=(200, 3)):
+        model.add_point3D(place, pycolmap.Track(), np.zeros(3, np.uint8))
+    job, _ = make_capture(tmp_path, frames=3)
+    write_parts(job, [(model, None)])
+    monkeypatch.setattr(undistort, "check_part", lambda _: None)
+    placed = undistort.place_model(job).world
+    assert placed.evidence.up_found == found
+    up = -Similarity.from_json(placed.similarity).rotation @ world.inv().as_matrix()[:, 1]
+    assert (degrees_between(up, np.array([0, 0, 1.0])) < 1) == found
+
+
 def test_a_frame_that_does_not_exist_stops_it():
     with pytest.raises(ConfigError):
         world_of(make_room(), between=ScaleBetween("x.png", B, 1.0))
@@ -139,7 +169,9 @@ def test_a_frame_that_does_not_exist_stops_it():
 def test_a_rendered_room_comes_out_upright(shared_data: Path, name: str):
     room = _rendered(shared_data / "rooms" / name, Similarity(0.3, _turn(), np.array([1., 2, 3])))
     points, viewmats, truth = room
-    world = world_transform(points, viewmats, gravity=True, scale_between=None, metric=False)
+    world = world_transform(
+        points, viewmats, level_views=np.array(list(viewmats.values())), scale_between=None,
+        metric=False)
     assert world.evidence.floor_found
     into_room = truth.after(world.similarity.inverse())
     # Measured: 0.016 and 0.011 degrees, 2 and 4 mm.

@@ -11,8 +11,8 @@ from synthetic import center_error, make_capture, part
 from recon_cli.sfm import database
 from recon_cli.sfm.features import bridge, matching, xfeat_weights
 from recon_cli.sfm.features.bridge import PhotoFeatures, find_bridge, match_rows, match_sift
-from recon_cli.sfm.features.xfeat import DESCRIPTOR_SIZE, DESCRIPTOR_STEPS, LearnedFeatures
-from recon_cli.sfm.job import Reporter, StepLog, parse
+from recon_cli.sfm.features.xfeat import DESCRIPTOR_STEPS, LearnedFeatures
+from recon_cli.sfm.job import Reporter, parse
 from recon_cli.sfm.mapping import fallbacks, mapper
 
 NONE = np.zeros((0, 2), np.int64)
@@ -20,7 +20,7 @@ FOCAL, WIDTH, HEIGHT = 500.0, 640, 480
 
 
 def learned_rows(generator, count):
-    rows = generator.normal(size=(count, DESCRIPTOR_SIZE))
+    rows = generator.normal(size=(count, 64))
     rows *= DESCRIPTOR_STEPS / np.linalg.norm(rows, axis=1, keepdims=True)
     return np.rint(rows).astype(np.float32)
 
@@ -180,7 +180,7 @@ def bridges(monkeypatch):
     monkeypatch.setattr(xfeat_weights, "load_weights", dict)
     monkeypatch.setattr(bridge, "_read_photos", lambda job, _, names: {
         name: PhotoFeatures(job.names.index(name) + 1, None, None, None, LearnedFeatures(
-            np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_SIZE), np.float32))) for name in names})
+            np.zeros((0, 2)), np.zeros((0, 64), np.float32))) for name in names})
 
     def find(job, photos, pairs, _):
         with pycolmap.Database.open(job.database) as opened:
@@ -263,7 +263,7 @@ def test_bridges_that_place_too_few_are_mapped_again_with_lower_thresholds(
         [part(truth, job.names[:12])] if job.matches_db else find(job, report)))
     with pytest.raises(KeyboardInterrupt):
         build(job)
-    assert StepLog(job.attempts).find_damage() is None
+    assert not job.tried.find_damage()
     result, _ = build(job)
     assert [(item.name, item.registered) for item in result.attempts] == [
         ("exhaustive", 10), ("bridge", 12), ("bridge relaxed", 20)]
@@ -343,8 +343,8 @@ def test_a_killed_bridge_gives_the_same_model_when_it_is_run_again(
         interrupt if job.matches_db else real)(job, report))
     with pytest.raises(KeyboardInterrupt):
         build(job)
-    assert StepLog(job.attempts).is_finished("exhaustive")
-    assert not StepLog(job.attempts).is_finished("bridge")
+    assert job.tried.is_finished("exhaustive")
+    assert not job.tried.is_finished("bridge")
     own = job.attempts / "bridge" / "linked.db"
     own.write_bytes(own.read_bytes()[:5000])  # and what it left was damaged
     monkeypatch.setattr(mapper, "map_incrementally", real)

@@ -1,6 +1,7 @@
 """How well each camera of a photo model is known."""
 
 from collections import defaultdict
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -13,6 +14,7 @@ from recon_cli.sfm.verdict.camera_covariance import (
     SHARED_ERRORS,
     describe_inexact,
     estimate_camera_errors,
+    list_loose,
     list_rough,
     measure_rms,
 )
@@ -111,6 +113,18 @@ def test_photos_of_much_in_common_are_not_rough_and_one_that_shares_few_points_i
 def test_a_camera_that_few_points_place_is_rough_however_well_it_fits():
     errors = {"a.png": 0.001, "b.png": 0.001, "c.png": 0.021}
     assert list_rough(errors, {"a.png": 30, "b.png": 29, "c.png": 300}) == ("b.png", "c.png")
+
+
+def test_a_camera_that_few_points_place_must_explain_its_matches():
+    names = ("few.png", "many.png", "right.png", "walk.png")
+    pairs = np.array([[0, 1], [0, 2], [1, 2], [1, 3]])
+    evidence = SimpleNamespace(
+        names=names, pairs=pairs, placed=np.full(4, True), points=np.array([22, 300, 29, 5]),
+        matches=np.array([100, 20, 200, 80]), explained=np.array([55, 20, 190, 10]))
+    errors = dict.fromkeys(names[:3], 0.001)  # a walk's camera has none
+    assert [(each.name, each.matches) for each in list_loose(errors, evidence)] == [
+        ("few.png", 120)]
+    assert not list(list_loose({}, evidence))
 
 
 def test_an_error_is_a_share_of_the_extent_even_where_nothing_tells_it():

@@ -31,7 +31,7 @@ def write_matches(path, first, second):
 
 @pytest.fixture
 def path(tmp_path):
-    """A sealed database with three images, the features of two and the matches of these."""
+    """A database of three images with recorded rows: features of two and their matches."""
     for name in NAMES:
         Image.new("RGB", (64, 48)).save(tmp_path / name)
     job = MappingJob(
@@ -42,7 +42,7 @@ def path(tmp_path):
     create_database(job)
     write_features(job.database, (1, 2))
     write_matches(job.database, 1, 2)
-    database.seal(job.database)
+    database.record_rows(job.database)
     return job.database
 
 
@@ -51,16 +51,16 @@ def change(path, statement):
         assert opened.execute(statement).rowcount != 0
 
 
-def test_what_was_sealed_is_kept(path):
-    assert database.keep_sealed(path) is None
+def test_recorded_rows_are_kept(path):
+    assert database.restore_rows(path) is None
     assert database.progress(path, "features") == 2
     assert database.pair_names(path) == {("a.png", "b.png")}
 
 
-def test_what_was_written_after_the_seal_is_deleted(path):
+def test_rows_that_were_written_later_are_deleted(path):
     write_features(path, (3,))
     write_matches(path, 2, 3)
-    assert database.keep_sealed(path) is None
+    assert database.restore_rows(path) is None
     assert database.progress(path, "features") == 2
     assert sorted(database.keypoint_counts(path)) == ["a.png", "b.png"]
     assert database.pair_names(path) == {("a.png", "b.png")}
@@ -75,29 +75,29 @@ def test_what_was_written_after_the_seal_is_deleted(path):
     ("UPDATE matches SET data = zeroblob(16)", "matches"),
     ("UPDATE two_view_geometries SET config = 3", "matches"),
     ("DELETE FROM matches", "matches")])
-def test_a_sealed_row_that_changed_names_the_step_to_take_again(path, statement, step):
+def test_a_recorded_row_that_changed_names_the_step_to_take_again(path, statement, step):
     change(path, statement)
-    assert database.keep_sealed(path) == step
+    assert database.restore_rows(path) == step
 
 
 @pytest.mark.parametrize("text", [None, "", "{", "[]", "{}", '{"features": 3, "rest": 0}'])
 def test_without_its_digests_a_database_is_not_believed(path, text):
-    digests = path.with_name("database.digests.json")
+    digests = path.with_name("database.steps")
     digests.unlink()
     if text is not None:
         digests.write_text(text)
-    assert database.keep_sealed(path) == "features"
+    assert database.restore_rows(path) == "features"
 
 
-def test_a_file_that_is_no_database_is_not_sealed(path):
+def test_a_file_that_is_no_database_has_no_rows(path):
     path.write_bytes(b"no database")
-    database.seal(path)
-    assert database.keep_sealed(path) == "features"
+    database.record_rows(path)
+    assert database.restore_rows(path) == "features"
 
 
 def test_matches_can_be_cleared(path):
     database.clear_matches(path)
     assert database.pair_names(path) == set()
     assert database.matched_ids(path) == []
-    database.unseal(path)
-    assert not path.with_name("database.digests.json").exists()
+    database.forget_rows(path)
+    assert not path.with_name("database.steps").exists()

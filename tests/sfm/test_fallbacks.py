@@ -14,7 +14,7 @@ from synthetic import center_error, make_capture, part
 from recon_cli.errors import SfmError
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm.features import keyframes
-from recon_cli.sfm.job import CameraGroup, Reporter, StepLog, parse
+from recon_cli.sfm.job import CameraGroup, Reporter, parse
 from recon_cli.sfm.mapping import fallbacks, mapper, parts, skeleton, wide_lens
 from recon_cli.sfm.mapping.fallbacks import (
     MapperAttempt,
@@ -25,6 +25,7 @@ from recon_cli.sfm.mapping.fallbacks import (
 )
 from recon_cli.sfm.mapping.lens_trial import BetterLens
 from recon_cli.sfm.mapping.merge_models import ModelCandidate
+from recon_cli.workspace.steps import StepFolder
 
 NAMES = tuple(f"{index:06d}.png" for index in range(60))
 GOOD = MapperAttempt(
@@ -331,7 +332,7 @@ def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, m
     monkeypatch.setattr(mapper, "map_globally", interrupt)
     with pytest.raises(KeyboardInterrupt):
         build(job)
-    assert StepLog(job.attempts).is_finished("relaxed")
+    assert job.tried.is_finished("relaxed")
     monkeypatch.undo()
     monkeypatch.setattr(mapper, "map_incrementally", interrupt)
     result = build(job)
@@ -348,7 +349,7 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
     job, truth = capture
     owner, name = {
         "match": (fallbacks.database, "pair_names"), "models": (mapper, "map_incrementally"),
-        "model": (fallbacks, "write_model"), "note": (StepLog, "finish"),
+        "model": (fallbacks, "write_model"), "note": (StepFolder, "finish"),
         "verdict": (parts.atomic, "write_json"), "publish": (parts, "publish")}[place]
 
     def full(*_, **__):

@@ -11,21 +11,15 @@ import pytest
 from recon_cli.errors import FormatError, SfmError, WorkspaceError
 from recon_cli.scene.camera import Lens
 from recon_cli.sfm.job import (
-    LOG_FILE,
-    SPLIT,
     STEPS,
     CameraGroup,
     MappingJob,
     Phase,
     Reporter,
-    StepLog,
     fresh_folder,
-    is_vouched,
     parse,
     publish,
-    vouch,
 )
-from recon_cli.sfm.results import CountedResult, SplitResult
 
 
 def job(count, pairs="auto"):
@@ -86,92 +80,6 @@ def test_poses_that_are_ignored_are_not_known():
     assert given.known_poses
     assert not replace(given, pose_use="ignore").known_poses
     assert replace(given, pose_use="ignore").steps == STEPS
-
-
-@pytest.fixture
-def finished(tmp_path):
-    """A folder in which all steps are finished."""
-    ledger = StepLog(tmp_path)
-    for step in ("features", "matches"):
-        ledger.finish(step, CountedResult(rows=3))
-    for step in ("split", "model"):
-        (tmp_path / step / "images").mkdir(parents=True)
-        (tmp_path / step / "images" / "a.bin").write_bytes(b"12345")
-        ledger.finish(step, SplitResult(segments=((step,),)), tmp_path / step)
-    return tmp_path
-
-
-def done(folder):
-    ledger = StepLog(folder)
-    return [step for step in (*STEPS[:2], SPLIT, *STEPS[2:]) if ledger.is_finished(step)]
-
-
-def test_results_are_read_back_by_the_next_process(finished):
-    assert StepLog(finished).result("features", CountedResult) == CountedResult(rows=3)
-    assert StepLog(finished).result("model", SplitResult).segments == (("model",),)
-
-
-def test_a_result_of_another_version_is_as_good_as_none(finished):
-    assert StepLog(finished).result("features", SplitResult) is None
-
-
-def test_an_empty_folder_has_nothing_finished(tmp_path):
-    assert done(tmp_path) == []
-
-
-def test_a_missing_file_takes_its_step_back(finished):
-    (finished / "split" / "images" / "a.bin").unlink()
-    assert done(finished) == ["features", "matches", "model"]
-
-
-def test_a_file_cut_short_takes_its_step_back(finished):
-    (finished / "model" / "images" / "a.bin").write_bytes(b"123")
-    assert done(finished) == ["features", "matches", "split"]
-
-
-def test_files_without_a_note_prove_nothing(finished):
-    (finished / LOG_FILE).unlink()
-    assert done(finished) == []
-
-
-def test_a_note_that_cannot_be_read_proves_nothing(finished):
-    (finished / LOG_FILE).write_text('{"features": ')
-    assert done(finished) == []
-
-
-def test_a_flipped_byte_is_found_before_a_step_is_believed(finished):
-    assert StepLog(finished).find_damage() is None
-    (finished / "split" / "images" / "a.bin").write_bytes(b"12375")
-    assert StepLog(finished).find_damage() == "split"
-
-
-def test_a_file_that_a_step_writes_besides_its_folder_is_looked_at_too(tmp_path):
-    (tmp_path / "verdict.json").write_text("{}")
-    StepLog(tmp_path).finish("model", CountedResult(rows=7), also=("verdict.json", "none.json"))
-    assert StepLog(tmp_path).find_damage() is None
-    (tmp_path / "verdict.json").write_text("[]")
-    assert StepLog(tmp_path).find_damage() == "model"
-
-
-def test_a_note_with_a_changed_figure_proves_nothing(finished):
-    text = (finished / LOG_FILE).read_text()
-    (finished / LOG_FILE).write_text(text.replace('"rows": 3', '"rows": 4', 1))
-    assert done(finished) == []
-
-
-def test_a_folder_is_vouched_for_until_it_changes(tmp_path):
-    (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "a.bin").write_bytes(b"12345")
-    assert not is_vouched(tmp_path / "models")
-    vouch(tmp_path / "models")
-    assert is_vouched(tmp_path / "models")
-    (tmp_path / "models" / "a.bin").write_bytes(b"12346")
-    assert not is_vouched(tmp_path / "models")
-
-
-def test_what_builds_on_a_forgotten_step_is_forgotten_too(finished):
-    StepLog(finished).forget_from("matches")
-    assert done(finished) == ["features"]
 
 
 def test_publishing_replaces_what_an_interrupted_run_left(tmp_path):

@@ -6,9 +6,9 @@ from made_model import FOCAL, MadeModel, along, wall
 
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.features import matching
-from recon_cli.sfm.segments.loop_closure import bend_model, bend_segments, move_frames
+from recon_cli.sfm.segments.edge_information import SCALES, measure_information
+from recon_cli.sfm.segments.loop_closure import move_frames, optimize_model, optimize_segments
 from recon_cli.sfm.segments.shared_points import describe_segment, find_shared_points
-from recon_cli.sfm.segments.stiffness import SCALES, measure_stiffness
 
 TURN = 24  # the frame from which on the walk comes back
 STAY = Similarity()
@@ -55,7 +55,7 @@ def matches_of(made, folder):
 
 
 def test_a_model_that_is_right_is_left_as_it_is(made, tmp_path):
-    assert bend_model(made.model(), matches_of(made, tmp_path), seed=0) is None
+    assert optimize_model(made.model(), matches_of(made, tmp_path), seed=0) is None
 
 
 @pytest.mark.parametrize(("scale", "degrees"), [(1.37, 0), (0.75, 0), (1.1, 6)])
@@ -63,13 +63,13 @@ def test_a_loop_takes_a_break_of_scale_back(made, tmp_path, scale, degrees):
     turn = made.poses[TURN].inverse().translation
     model = broken(made, about(turn, scale, degrees))
     assert errors(model, made).max() > 0.5
-    bent = bend_model(model, matches_of(made, tmp_path), seed=0)
-    assert errors(bent, made).max() < 0.1  # a tenth of the break, and more
+    closed = optimize_model(model, matches_of(made, tmp_path), seed=0)
+    assert errors(closed, made).max() < 0.1  # a tenth of the break, and more
 
 
 def test_what_only_looks_alike_closes_no_loop(made, tmp_path):
     model = broken(made, about(made.poses[TURN].inverse().translation, 1.0, 60))
-    assert bend_model(model, matches_of(made, tmp_path), seed=0) is None
+    assert optimize_model(model, matches_of(made, tmp_path), seed=0) is None
 
 
 def test_moved_frames_see_their_points_where_they_saw_them(made):
@@ -83,10 +83,10 @@ def test_moved_frames_see_their_points_where_they_saw_them(made):
 
 
 def test_a_walk_is_weakest_where_no_point_is_seen_from_both_sides(made):
-    stiff = measure_stiffness(made.model(), made.names)
-    assert stiff.turn.argmax() == TURN - 1
-    assert stiff.scale[TURN - 1] == SCALES[1]
-    assert np.median(stiff.scale) < 0.05
+    known = measure_information(made.model(), made.names)
+    assert known.turn.argmax() == TURN - 1
+    assert known.scale[TURN - 1] == SCALES[1]
+    assert np.median(known.scale) < 0.05
 
 
 def test_segments_meet_in_their_common_frames_and_close_their_loop(tmp_path):
@@ -97,10 +97,10 @@ def test_segments_meet_in_their_common_frames_and_close_their_loop(tmp_path):
     matches = matches_of(made, tmp_path)
     common = find_shared_points(segments, matches)
     start = {0: STAY, 1: about(made.poses[TURN].inverse().translation, 1.3, 4)}
-    bent = bend_segments(segments, start, common, matches, seed=0)
-    assert bent.tension[0, 1] < 1
+    closed = optimize_segments(segments, start, common, matches, seed=0)
+    assert closed.residuals[0, 1] < 1
     for name, pose in zip(made.names, made.poses, strict=True):
         center = pose.inverse().translation
         for index in (0, 1):
-            if (index, name) in bent.motions:
-                assert np.linalg.norm(bent.motions[index, name].points(center) - center) < 0.1
+            if (index, name) in closed.poses:
+                assert np.linalg.norm(closed.poses[index, name].points(center) - center) < 0.1

@@ -2,15 +2,15 @@
 
 from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from recon_cli.progress import NullProgress
-from recon_cli.sfm.job import LOG_FILE, STEPS, Phase
+from recon_cli.sfm.job import STEPS, Phase
 from recon_cli.sfm.mapping import process
 from recon_cli.sfm.mapping.process import Monitor, TimeUpError, last_error, run_job
+from recon_cli.workspace.steps import StepFolder
 
 GLOG = "I20260101 10:00:00.000001 139 timer.cc:90] Elapsed time: 0.1 [minutes]\n"
 
@@ -69,7 +69,7 @@ def test_a_core_is_reported_idle_once_when_all_pairs_are_matched(events, idle):
 class Attempts:
     """What a job needs to know of itself here."""
 
-    attempts: Path
+    tried: StepFolder
     max_minutes: float = 5.0
 
 
@@ -85,8 +85,9 @@ def test_when_the_time_is_up_the_best_attempt_that_ended_is_the_result(
 
     monkeypatch.setattr(process, "_run", run)
     monkeypatch.setattr(process, "Monitor", lambda *_: None)
+    attempts = Attempts(StepFolder(tmp_path, key="of these matches"))
     if tried:
-        (tmp_path / LOG_FILE).write_text("{}")
+        attempts.tried.finish("exhaustive")
     with nullcontext() if tried else pytest.raises(TimeUpError):
-        run_job(Attempts(tmp_path), progress=NullProgress(), record=print, on_idle=print)
+        run_job(attempts, progress=NullProgress(), record=print, on_idle=print)
     assert runs == [(5.0, 5.0), (0.0, 5.0)][:1 + tried]

@@ -177,7 +177,7 @@ def test_segments_of_a_chain_come_into_one_frame(chain):
     joins = [chain.judge(0, 1), chain.judge(1, 2)]
     group, = place_segments(cameras, joins)
     for index, frame in enumerate((STAY, FIRST, SECOND)):
-        assert_same(group.motions[index], frame.inverse())
+        assert_same(group.poses[index], frame.inverse())
     assert group.refused == ()
 
 
@@ -188,7 +188,7 @@ def test_a_break_in_the_chain_leaves_two_groups_and_is_told(chain):
         shared, theirs=np.random.default_rng(2).normal(size=shared.theirs.shape))
     broken = judge_join(nonsense, cameras[1], cameras[2], seed=0)
     groups = place_segments(cameras, [chain.judge(0, 1), broken])
-    assert [sorted(group.motions) for group in groups] == [[0, 1], [2]]
+    assert [sorted(group.poses) for group in groups] == [[0, 1], [2]]
     assert any("segments 1 and 2 are not joined" in text for text in groups[0].refused)
 
 
@@ -207,7 +207,7 @@ def drifted(chain, degrees=2.0, scale=0.97):
 
 def end_error(group, chain, cameras):
     """How far the last segment is from where it belongs, as a share of the walk's extent."""
-    found = group.motions[2].points(cameras[2].centers)
+    found = group.poses[2].points(cameras[2].centers)
     return np.linalg.norm(found - chain.centers[40:], axis=1).max() / 10
 
 
@@ -226,5 +226,5 @@ def test_a_loop_that_is_none_is_refused_and_moves_nothing(chain):
     wrong = chain.judge(0, 2, pairs=LOOP + APART, clouds=away)
     assert wrong.holds  # it agrees with itself
     group, = place_segments(cameras, [chain.judge(0, 1), chain.judge(1, 2), wrong])
-    assert_same(group.motions[2], SECOND.inverse())
+    assert_same(group.poses[2], SECOND.inverse())
     assert any("loop of segments 0 and 2" in text for text in group.refused)

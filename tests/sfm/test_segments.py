@@ -12,10 +12,11 @@ import pytest
 from recon_cli.errors import ConfigError, ReconError, SfmError, WorkspaceError
 from recon_cli.io.tracks import Tracks
 from recon_cli.progress import NullProgress
-from recon_cli.sfm.job import SPLIT, CameraGroup, MappingJob, StepLog
+from recon_cli.sfm.job import SPLIT, STEPS, CameraGroup, MappingJob
 from recon_cli.sfm.mapping.process import CrashError
 from recon_cli.sfm.results import SplitResult, StepResult
 from recon_cli.sfm.segments import segments
+from recon_cli.workspace.steps import StepFolder
 
 
 def names_of(count):
@@ -77,7 +78,7 @@ class Mapper:
 
     def __call__(self, job, *, record, **_):
         self.jobs.append(job)
-        log = StepLog(job.out)
+        log = StepFolder(job.out)
         if all(log.is_finished(step) for step in job.steps):
             return
         record(1, 4)
@@ -154,7 +155,7 @@ def test_a_segment_whose_process_is_killed_is_tried_again(job, monkeypatch):
     assert run(job, monkeypatch, mapper).failed == {}
     assert mapper.ran() == [0, 1, 1, 2]
     again = Mapper(of_1=[CrashError("It was ended by SIGKILL.")] * segments.TRIES)
-    StepLog(job.segment(1)).forget_from("features")
+    StepFolder(job.segment(1)).forget(*STEPS)
     assert run(job, monkeypatch, again).failed == {1: "It was ended by SIGKILL."}
 
 
@@ -193,11 +194,11 @@ def test_no_segment_at_all_is_an_error(job, monkeypatch):
 def test_an_interrupted_run_keeps_what_is_finished(job, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(job, monkeypatch, Mapper(of_2=[KeyboardInterrupt()]))
-    kept = job.segment(0) / "steps.json"
+    kept = job.segment(0) / "steps.jsonl"
     before = kept.stat().st_mtime_ns
     assert run(job, monkeypatch, Mapper()).failed == {}
     assert kept.stat().st_mtime_ns == before
-    assert StepLog(job.segment(2)).is_finished("model")
+    assert StepFolder(job.segment(2)).is_finished("model")
 
 
 def test_segments_of_another_cut_are_not_taken_for_these(job, monkeypatch):
@@ -217,7 +218,7 @@ def test_photos_are_split_by_the_mapping_process(job, monkeypatch):
         def __call__(self, each, **options):
             if each.last == SPLIT:
                 assert each.steps == ("features", "matches", "split")
-                StepLog(each.out).finish(SPLIT, SplitResult(segments=tuple(parts)))
+                StepFolder(each.out).finish(SPLIT, SplitResult(segments=tuple(parts)))
                 return
             super().__call__(each, **options)
 

@@ -39,22 +39,24 @@ def test_segments_are_mapped_at_once_and_joined_on_one_core():
         70 * 40 / 4 + 60 * 100 / 4 + 60 * 1000)
 
 
-# Seconds of two idle cores in tests/bench/notes/cameras.md.
-@pytest.mark.parametrize(("frames", "megapixels", "tracked", "took"), [
-    (76, 0.204, True, 35), (75, 0.204, True, 30), (100, 0.92, True, 60), (100, 0.518, True, 74),
-    (52, 0.309, True, 26), (90, 0.41, True, 43), (30, 0.307, True, 12), (50, 2.07, False, 35),
-    (70, 2.07, False, 47), (97, 2.76, False, 71), (170, 0.48, False, 68)])
-def test_what_captures_took_is_told_within_a_third(frames, megapixels, tracked, took):
-    told = expected_seconds(Workload(frames, megapixels, tracked), 2, costs=COSTS)
-    assert told == pytest.approx(took, rel=1 / 3)
-
-
-# CPU seconds of long walks (tests/bench/notes/cameras.md).
+# CPU seconds of finished workspaces on the machine of COSTS (tests/bench/notes/cameras.md).
 @pytest.mark.parametrize(("frames", "keyframes", "megapixels", "took"), [
-    (360, 184, 0.194, 133), (270, 57, 0.41, 89), (400, 85, 0.92, 232), (300, 73, 0.23, 110)])
-def test_what_long_walks_took_is_told_within_a_third(frames, keyframes, megapixels, took):
+    (75, 75, 0.204, 62), (75, 75, 0.204, 68), (60, 60, 0.204, 61), (60, 60, 0.204, 48),
+    (29, 29, 0.307, 28), (50, 50, 2.07, 166), (360, 184, 0.194, 208)])
+def test_what_walks_took_is_told_within_a_third(frames, keyframes, megapixels, took):
     work = Workload(frames, megapixels, tracked=True, keyframes=keyframes)
     assert expected_seconds(work, 1, costs=COSTS) == pytest.approx(took, rel=1 / 3)
+
+
+def test_a_machine_that_multiplies_slowly_is_slower(monkeypatch):
+    usual, product = measure_slowness(1), time_estimate.np.matmul
+
+    def multiply_slowly(a, b):
+        time.sleep(5 * PIECE_SECONDS)
+        return product(a, b)
+
+    monkeypatch.setattr(time_estimate.np, "matmul", multiply_slowly)
+    assert measure_slowness(1) > max(5, usual)
 
 
 def test_a_machine_is_measured_in_a_fraction_of_a_second():

@@ -10,7 +10,7 @@ from synthetic import make_capture
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.job import Reporter
 from recon_cli.sfm.mapping import mapper
-from recon_cli.sfm.poses.tracked_poses import adjust_tracked, hold_rest, match_near
+from recon_cli.sfm.poses.tracked_poses import add_prior_poses, adjust_tracked, match_near
 
 CAMERAS = {1}  # whose intrinsics are known
 
@@ -80,7 +80,7 @@ def test_a_frame_without_matches_is_held_between_its_neighbours(capture):
     given = drift(views)
     found = adjust_tracked(job, given, CAMERAS)
     assert found.held == (blank,)
-    hold_rest(found.model, found.held, given)
+    add_prior_poses(found.model, found.held, given)
     image = found.model.find_image_with_name(blank)
     other = found.model.find_image_with_name(job.names[9])
     truth = views[blank] @ np.linalg.inv(views[job.names[9]])

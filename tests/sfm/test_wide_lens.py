@@ -151,7 +151,7 @@ def test_a_lens_that_was_asked_for_wrongly_is_refused_with_the_right_one(tmp_pat
     job = dataclasses.replace(job, groups=(dataclasses.replace(job.groups[0], model="OPENCV"),))
     with pytest.raises(SfmError, match="OPENCV does not fit camera 1") as caught:
         fallbacks.build_model(job, Reporter(io.BytesIO()))
-    assert "recon sfm --camera-model OPENCV_FISHEYE" in caught.value.message
+    assert "--camera-model OPENCV_FISHEYE" in caught.value.message
     kept = fallbacks.build_model(dataclasses.replace(job, accept_weak=True),
                                  Reporter(io.BytesIO()))
     assert kept.broken == ()

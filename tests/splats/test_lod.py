@@ -10,7 +10,7 @@ import torch
 
 from recon_cli.errors import FormatError
 from recon_cli.splats import lod
-from recon_cli.splats.lod import make_levels, read_lod, write_lod
+from recon_cli.splats.lod import load_lod, make_levels, write_lod
 from recon_cli.splats.registry import read_splats
 from recon_cli.splats.sog import Unpacked, load_sog, read_files, write_sog
 
@@ -107,14 +107,14 @@ def test_a_scene_of_which_some_have_coefficients_comes_back_in_its_degree(tmp_pa
     if degree:
         splats.sh_rest = splats.sh_rest[:250].clone()
     written(tmp_path, splats)
-    back = read_lod(tmp_path / "lod-meta.json")
+    back = load_lod(tmp_path / "lod-meta.json").splats
     assert (len(back), back.sh_degree) == (600, degree)
 
 
 def test_a_single_gaussian_is_one_leaf(tmp_path):
     written(tmp_path, archive_splats.room(1))
     assert set(meta_of(tmp_path)["tree"]) == {"bound", "lods"}
-    assert len(read_lod(tmp_path / "lod-meta.json")) == 1
+    assert len(load_lod(tmp_path / "lod-meta.json").splats) == 1
 
 
 def test_the_same_scene_gives_the_same_bytes_and_replaces_another(tmp_path):
@@ -135,7 +135,7 @@ def test_an_environment_is_a_part_of_the_scene(tmp_path):
     shutil.copytree(tmp_path / "3_0", tmp_path / "env")
     meta = meta_of(tmp_path) | {"environment": "env/meta.json"}
     (tmp_path / "lod-meta.json").write_text(json.dumps(meta))
-    assert len(read_lod(tmp_path / "lod-meta.json")) == 2000 + 31
+    assert len(load_lod(tmp_path / "lod-meta.json").splats) == 2000 + 31
 
 
 def _first_leaf(meta):
@@ -173,7 +173,7 @@ def test_a_damaged_index_is_refused(tmp_path, damage):
     damage(meta)
     (tmp_path / "lod-meta.json").write_text(json.dumps(meta))
     with pytest.raises(FormatError):
-        read_lod(tmp_path / "lod-meta.json")
+        load_lod(tmp_path / "lod-meta.json")
 
 
 @pytest.mark.parametrize("name", ["meta.json", "means_l.webp", "shN_labels.webp"])
@@ -186,7 +186,7 @@ def test_a_truncated_or_missing_file_is_refused(tmp_path, name, keep):
     if keep:
         path.write_bytes(data[:keep])
     with pytest.raises(FormatError):
-        read_lod(tmp_path / "lod-meta.json")
+        load_lod(tmp_path / "lod-meta.json")
 
 
 def test_many_files_may_not_claim_more_than_all_of_them_can_hold(tmp_path, monkeypatch):
@@ -196,7 +196,7 @@ def test_many_files_may_not_claim_more_than_all_of_them_can_hold(tmp_path, monke
         path.write_text(json.dumps(json.loads(path.read_text()) | {"count": 700_000}))
     monkeypatch.setattr(lod, "read_files", None)  # nothing is decoded
     with pytest.raises(FormatError, match=r"(1400|2100|2800|3500)000 Gaussians in"):
-        read_lod(tmp_path / "lod-meta.json")
+        load_lod(tmp_path / "lod-meta.json")
 
 
 def test_a_pipe_among_the_files_is_not_waited_for(tmp_path):
@@ -205,7 +205,7 @@ def test_a_pipe_among_the_files_is_not_waited_for(tmp_path):
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(FormatError, match="named pipe"):
-        read_lod(tmp_path / "lod-meta.json")
+        load_lod(tmp_path / "lod-meta.json")
 
 
 def test_names_in_a_file_do_not_lead_out_of_its_folder(tmp_path):
@@ -215,4 +215,4 @@ def test_names_in_a_file_do_not_lead_out_of_its_folder(tmp_path):
     meta["means"]["files"][0] = "../0_1/means_l.webp"
     path.write_text(json.dumps(meta))
     with pytest.raises(FormatError, match="leaves the folder"):
-        read_lod(tmp_path / "lod-meta.json")
+        load_lod(tmp_path / "lod-meta.json")

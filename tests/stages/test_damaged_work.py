@@ -23,7 +23,7 @@ from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import DenoiseConfig, EvaluateConfig, IngestConfig, PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.stages import denoise, evaluate, export, ingest, prune, train
-from recon_cli.workspace import journal
+from recon_cli.workspace import steps
 from recon_cli.workspace.atomic import delete, write_bytes
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import PartialRun, ResultKey
@@ -113,7 +113,7 @@ def check_every_damage(
 def kill_at_file(count: int) -> Callable[[pytest.MonkeyPatch], None]:
     """Returns what makes a run die once it has put so many files in place."""
     def kill(patch: pytest.MonkeyPatch) -> None:
-        confirm, done = journal.confirm, []
+        confirm, done = steps.confirm, []
 
         def confirm_then_die(path: Path) -> None:
             confirm(path)
@@ -123,7 +123,7 @@ def kill_at_file(count: int) -> Callable[[pytest.MonkeyPatch], None]:
                    for each in done) == count:
                 raise Killed
 
-        patch.setattr(journal, "confirm", confirm_then_die)
+        patch.setattr(steps, "confirm", confirm_then_die)
     return kill
 
 
@@ -201,3 +201,16 @@ def test_work_of_an_undamaged_run_is_kept(tmp_path: Path) -> None:
     again, earlier = workspace.begin(key)
     assert (earlier.done, earlier.total) == (1, 2)
     assert [path.name for path in again.iterdir()] == ["kept.bin"]
+
+
+@pytest.mark.parametrize("own_digests", [True, False])
+def test_unfinished_work_of_an_earlier_version_is_begun_anew_with_a_notice(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, own_digests: bool
+) -> None:
+    workspace, key = Workspace(tmp_path), ResultKey("train", 1, {}, (), {})
+    out, _ = workspace.begin(key, own_digests=own_digests)
+    (out / "steps.json").write_text("{}")  # what that version wrote
+    steps.log_path(out).unlink(missing_ok=True)
+    again, _ = workspace.begin(key, own_digests=own_digests)
+    assert list(again.iterdir()) == []
+    assert "unfinished work is discarded" in caplog.text

@@ -71,8 +71,8 @@ def flat(similarity):
 def of_colmap(sparse):
     """The cameras of a COLMAP model by name."""
     inner = read_pinholes(sparse)
-    return {name: Camera(one.width, one.height, one.fx, one.fy, one.cx, one.cy, viewmat)
-            for name, _, viewmat in read_images(sparse / "images.bin") for one in [inner[name]]}
+    return {name: inner[name].pinhole(viewmat)
+            for name, _, viewmat in read_images(sparse / "images.bin")}
 
 
 def of_transforms(path):

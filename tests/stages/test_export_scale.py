@@ -88,7 +88,8 @@ APART = float(np.linalg.norm([0.4 - 0.4 * np.cos(6), -0.4 * np.sin(6), -0.6]))  
 def know_scale(inputs, **more):
     """Writes the world that sfm would record, with z up."""
     viewmats = {f"{at:06d}.png": np.eye(4) for at in range(3)}
-    world = world_transform(np.zeros((0, 3)), viewmats, gravity=True, given_up=(0.0, 0.0, 1.0),
+    world = world_transform(np.zeros((0, 3)), viewmats, given_up=(0.0, 0.0, 1.0),
+                            level_views=np.array(list(viewmats.values())),
                             **{"scale_between": None, "metric": True, **more})
     (inputs.folders["place"] / "world.json").write_text(json.dumps(world.summary().to_json()))
 

@@ -44,8 +44,9 @@ def test_pictures_and_poses_belong_together_and_end_with_z_up(name, frames, stil
     assert summary.metric == app.metric
     poses, listed = read_poses(tmp_path / "out" / POSES), read_frame_list(tmp_path / "out")
     world = world_transform(
-        np.zeros((0, 3)), poses.viewmats, gravity=poses.up is not None, scale_between=None,
-        metric=poses.metric, given_up=poses.up)
+        np.zeros((0, 3)), poses.viewmats, scale_between=None, metric=poses.metric,
+        given_up=poses.up,
+        level_views=None if poses.up is None else np.array(list(poses.viewmats.values())))
     first, found = relative(taken) if app.world is None else app.world, []
     for frame in listed.frames:
         pixels = np.asarray(Image.open(tmp_path / "out" / "frames" / frame.name))

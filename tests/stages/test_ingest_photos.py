@@ -93,7 +93,7 @@ def test_where_no_mask_is_called_like_a_photo_the_right_name_is_told(tmp_path, n
     for index in range(12):
         mask_of(folder / "masks", f"IMG_{index:04d}_mask.png", np.full((48, 64), 255, np.uint8))
     take(folder, tmp_path / "out")
-    assert "and 4 more" in notices()[0]
+    assert "and 7 more" in notices()[0]
     assert "must be called IMG_0000.png or IMG_0000.jpg.png" in notices()[1]
 
 
@@ -102,8 +102,8 @@ def test_of_many_broken_photos_the_first_are_told_one_by_one(tmp_path, notices):
     for index in range(12):
         (folder / f"X{index:02d}.jpg").touch()
     take(folder, tmp_path / "out")
-    assert sum("A photo is left out" in text for text in notices()) == 8
-    assert notices()[8].startswith("4 more photos are left out")
+    assert sum("A photo is left out" in text for text in notices()) == 5
+    assert notices()[5].startswith("7 more photos are left out")
 
 
 def test_a_split_that_leaves_nothing_to_train_on_is_refused(tmp_path):

@@ -22,6 +22,7 @@ from recon_cli.io.images import read_png
 from recon_cli.sfm import database
 from recon_cli.sfm.job import STEPS
 from recon_cli.workspace.atomic import clear_leftovers
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import PlaceSummary
 
 STEP, COUNT = 4, 12  # every 4th frame of the sample: few, and each still overlaps the next
@@ -146,7 +147,7 @@ def test_undistortion_keeps_pixels_and_has_no_blank_border(mapped):
 def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
     out, _, _ = mapped
     assert sorted(path.name for path in out.iterdir()) == [
-        "database.db", "log.txt", "parts", "sparse", "steps.json", "undistorted", "verdict.json",
+        "database.db", "log.txt", "parts", "sparse", "steps.jsonl", "undistorted", "verdict.json",
         "world.json"]
     scale, world = (json.loads((out / name).read_text()) for name in ("verdict.json", "world.json"))
     assert world["evidence"]["scale_spread"] == max(
@@ -194,10 +195,7 @@ def kill_when(base, out, reached):
 
 
 def noted(out, step):
-    try:
-        return step in json.loads((out / "steps.json").read_text())
-    except (OSError, ValueError):
-        return False
+    return StepFolder(out).is_finished(step)
 
 
 @pytest.mark.integration
@@ -218,7 +216,7 @@ def test_a_run_killed_in_every_step_ends_with_the_bytes_of_one_that_was_not(
         table for table in ("keypoints", "descriptors", "matches", "two_view_geometries")
         if rows(out / "database.db", table) != rows(uninterrupted / "database.db", table)]
     attempts, first = (
-        json.loads((folder / "steps.json").read_text())["model"]["result"]["rungs"]
+        StepFolder(folder).result("model")["rungs"]
         for folder in (out, uninterrupted))
     for attempt in (*attempts, *first):
         del attempt["seconds"]

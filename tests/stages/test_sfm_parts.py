@@ -13,9 +13,9 @@ from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.io.colmap import read_images
 from recon_cli.sfm import database
-from recon_cli.sfm.job import StepLog
 from recon_cli.sfm.results import FeaturesResult, MatchesResult
 from recon_cli.stages import sfm
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import PlaceSummary
 
 # Two walks along two walls that have nothing in common.
@@ -37,8 +37,8 @@ def base(tmp_path_factory):
 def matched(out):
     """Leaves what a run leaves that was killed after it had matched the frames."""
     out.mkdir(parents=True)
-    database.seal(MADE.write_database(out / "database.db"))
-    log = StepLog(out)
+    database.record_rows(MADE.write_database(out / "database.db"))
+    log = StepFolder(out)
     log.finish("features", FeaturesResult(rows=0, keypoints=0, seconds=3.0, cpu_seconds=2.0))
     log.finish("matches", MatchesResult(
         rows=0, verified_pairs=0, matches=0, seconds=3.0, cpu_seconds=2.0))

@@ -16,6 +16,7 @@ from sfm_inputs import every_nth, run, write_inputs
 from recon_cli.context import StageContext
 from recon_cli.errors import SfmError
 from recon_cli.io.colmap import read_images
+from recon_cli.workspace.steps import StepFolder
 
 STEP, COUNT = 3, 30  # every third frame of the sample: two segments of 18, 7 of them in both
 FEATURES = 2048
@@ -90,10 +91,7 @@ def test_the_model_does_not_depend_on_how_many_segments_run_at_once(mapped, room
 
 
 def noted(folder, step):
-    try:
-        return step in json.loads((folder / "steps.json").read_text())
-    except (OSError, ValueError):
-        return False
+    return StepFolder(folder).is_finished(step)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")

@@ -13,7 +13,6 @@ from recon_cli.train.parts.background import (
     faces,
     find_background,
     look_at_one_thing,
-    project_points,
     splats_of,
 )
 
@@ -177,7 +176,7 @@ def test_a_gap_is_dropped_where_views_show_points_beyond(monkeypatch):
     shown = np.zeros(len(found))
     for view in views:
         camera = view.camera.resized(150, 112)
-        near, beyond = (np.stack(project_points(camera, some)[1:], 1)
+        near, beyond = (np.stack(camera.find_visible(some)[1:3], 1)
                         for some in (found, points[points[:, 2] > 4]))
         apart = np.linalg.norm(near[:, None] - beyond, axis=-1).min(1)
         shown += (apart <= 2) & (found[:, 2] < 4)

@@ -11,7 +11,7 @@ from recon_cli.trust.neighbors import (
     spread_views,
     support_of_all,
 )
-from recon_cli.trust.support import Support
+from recon_cli.trust.support import ViewSupport
 
 
 @pytest.mark.parametrize(("views", "count"), [
@@ -51,7 +51,7 @@ def test_a_view_shows_what_its_neighbours_show_as_far_as_it_lies_in_its_frame():
     splats = dots(means, radius=0.1)
     rows = [torch.tensor(own) for own in ([5], [0, 2, 6], [1, 3, 4, 6], [5])]
     centers = np.stack([cameras[number].center for number in (0, 1, 3, 4)])
-    support = Support.from_rows(rows, centers, torch.rand(len(means)), "digest")
+    support = ViewSupport.from_rows(rows, centers, torch.rand(len(means)), "digest")
     found = support_of_all(
         support, splats, cameras, pose_distances(cameras, splats), [0, 1, 3, 4])
     assert [own.tolist() for own in found.rows] == [
@@ -68,7 +68,7 @@ def test_where_every_view_is_rendered_nothing_changes():
     splats = dots(room(step=0.5))
     cameras = [camera([0, y, 1.2], [2, y, 1.2]) for y in (-0.5, 0, 0.5)]
     rows = [torch.arange(number, len(splats), 3) for number in range(3)]
-    support = Support.from_rows(
+    support = ViewSupport.from_rows(
         rows, np.stack([one.center for one in cameras]), torch.zeros(len(splats)))
     again = support_of_all(support, splats, cameras, pose_distances(cameras, splats), [0, 1, 2])
     assert all(torch.equal(*pair) for pair in zip(support.rows, again.rows, strict=True))

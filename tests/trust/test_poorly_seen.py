@@ -6,7 +6,7 @@ import torch
 from small_room import dots
 
 from recon_cli.trust.poorly_seen import PoorlySeenRegion, find_poorly_seen
-from recon_cli.trust.support import Support
+from recon_cli.trust.support import ViewSupport
 from recon_cli.trust.surface import find_cells
 
 STEP = 0.05
@@ -22,7 +22,7 @@ def floor(side=4.0):
 def find(points, seen):
     """`seen` are by view the camera and which points it shows."""
     splats = dots(points)
-    support = Support.from_rows(
+    support = ViewSupport.from_rows(
         [torch.from_numpy(np.flatnonzero(shown)) for _, shown in seen],
         np.array([center for center, _ in seen], float), torch.zeros(len(points)))
     frames = [f"{number}.png" for number in range(len(seen))]

@@ -6,7 +6,7 @@ import torch
 from small_room import camera, dots, photo
 
 from recon_cli.errors import FormatError
-from recon_cli.trust.support import Support, error_image, measure_support
+from recon_cli.trust.support import ViewSupport, error_image, measure_support
 
 EYES = [[0, -2, 0], [2, 0, 0]]  # at right angles as seen from the origin
 
@@ -92,7 +92,7 @@ def test_what_is_saved_is_read_back(tmp_path):
     splats = dots([[0, 0, 0], [0.2, 0, 0.1], [0, -9, 0]], radius=0.1)
     support = measure(splats, [photo(splats, camera(eye, [0, 0, 0])) for eye in EYES], digest="d")
     support.save(tmp_path / "s.safetensors")
-    again = Support.load(tmp_path / "s.safetensors")
+    again = ViewSupport.load(tmp_path / "s.safetensors")
     assert again.digest == "d"
     assert again.count.tolist() == support.count.tolist()
     torch.testing.assert_close(again.residual, support.residual)
@@ -104,4 +104,4 @@ def test_a_damaged_file_is_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "s.safetensors").write_bytes(content)
     with pytest.raises(FormatError, match="cannot be read"):
-        Support.load(tmp_path / "s.safetensors")
+        ViewSupport.load(tmp_path / "s.safetensors")

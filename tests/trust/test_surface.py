@@ -5,13 +5,13 @@ import pytest
 import torch
 from small_room import dots, room
 
-from recon_cli.trust.support import Support
+from recon_cli.trust.support import ViewSupport
 from recon_cli.trust.surface import find_cells, surface_rows, surface_shares
 
 
 def support_of(n, seen):
     """`seen` are by view the centre and the Gaussians that it shows."""
-    return Support.from_rows([torch.as_tensor(rows) for _, rows in seen],
+    return ViewSupport.from_rows([torch.as_tensor(rows) for _, rows in seen],
                       np.array([center for center, _ in seen], float), torch.zeros(n))
 
 

@@ -68,7 +68,7 @@ def test_integers_stay_what_they_are_up_to_64_bits_and_are_floats_beyond() -> No
 def test_everything_that_is_read_as_json_or_toml_goes_through_one_reader() -> None:
     package = Path(atomic.__file__).parents[1]
     others = {"workspace/atomic.py", "config/settings.py",  # the readers
-              "workspace/journal.py",  # on which the reader builds; its lines have checksums
+              "workspace/steps.py",  # on which the reader builds; its lines have checksums
               "render/self_check.py",  # may import nothing of the workspace
               }
     found = {

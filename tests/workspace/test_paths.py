@@ -11,7 +11,7 @@ from recon_cli.config.settings import read_settings
 from recon_cli.errors import ExitCode, FormatError, ReconError
 from recon_cli.io.colmap import Reader
 from recon_cli.splats.ply_tables import read_header
-from recon_cli.trust.support import Support
+from recon_cli.trust.support import ViewSupport
 from recon_cli.workspace.atomic import LEFTOVERS, read_json, replacing, write_bytes
 from recon_cli.workspace.digests import read_source
 from recon_cli.workspace.paths import refuse_special
@@ -46,7 +46,7 @@ def test_a_pipe_a_device_and_a_socket_are_named(tmp_path, pipe, monkeypatch):
 
 
 @pytest.mark.parametrize("read", [
-    read_json, read_settings, read_header, Support.load, lambda path: Reader(path, "hint"),
+    read_json, read_settings, read_header, ViewSupport.load, lambda path: Reader(path, "hint"),
     lambda path: read_source(path, without=path.parent)])
 def test_no_reader_waits_for_a_pipe(pipe, read):
     with pytest.raises(ReconError, match="named pipe"):

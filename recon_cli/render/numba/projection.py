@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from recon_cli.render.contract import DILATION, NEAR
+from recon_cli.render.contract import CULL_SLACK, DILATION, NEAR
 from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd import LANES
 from recon_cli.kernels.simd_functions import (
@@ -26,9 +26,8 @@ from recon_cli.render.numba.soa import (
     unit_quaternion)
 
 INFINITE = np.float32(3e38)
-_CULL_SLACK = 1e-3  # culling keeps what rounding leaves in doubt
 _F = np.float32
-_SLACK = np.float32(1e-3)  # in q; culling keeps what rounding leaves in doubt
+_SLACK = np.float32(CULL_SLACK)  # in q; culling keeps what rounding leaves in doubt
 _LARGEST = np.float32(1e30)  # a determinant beyond it has no useful inverse
 # spherical harmonics
 C0 = np.float32(0.28209479177387814)
@@ -50,9 +49,9 @@ def cull(counter, means, log_scales, logits, view, alpha_min, candidates, counts
     n = len(logits)
     blocks = (n + BLOCK - 1) // BLOCK
     f = _F(max(view.fx, view.fy))
-    logit_min = _F(math.log(alpha_min / (1 - alpha_min)) - _CULL_SLACK)
+    logit_min = _F(math.log(alpha_min / (1 - alpha_min)) - CULL_SLACK)
     # greatest 2 ln(o / alpha_min)
-    reach = _F(-2 * math.log(alpha_min) * (1 + _CULL_SLACK) + _CULL_SLACK)
+    reach = _F(-2 * math.log(alpha_min) * (1 + CULL_SLACK) + CULL_SLACK)
     R, bad = view.R, 0
     while True:
         block = fetch_add(counter, 0, 1)

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon_cli.render.contract import ALPHA_MIN, TILE
+from recon_cli.render.contract import ALPHA_MIN, CULL_SLACK, TILE
 from recon_cli.render.torch.projection import Projection, half_extents
 
 _CANDIDATES = 1 << 20  # Gaussian-tile pairs that are tested at a time: bounds the memory
-_SLACK = 1e-3  # in q; a tile is kept when rounding leaves the test in doubt
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +55,8 @@ def _candidate_chunks(
     half = half_extents(projection.cov2d, projection.opacities)
     limit = torch.tensor([tiles_x, tiles_y], device=half.device)
     # Pixel centres lie at +0.5: the first one at or right of m - h has index ceil(m - h - 0.5).
-    low = ((projection.means2d - half - 0.5 - _SLACK).ceil() / TILE).floor()
-    high = ((projection.means2d + half - 0.5 + _SLACK).floor() / TILE).floor()
+    low = ((projection.means2d - half - 0.5 - CULL_SLACK).ceil() / TILE).floor()
+    high = ((projection.means2d + half - 0.5 + CULL_SLACK).floor() / TILE).floor()
     low = torch.minimum(low.clamp_min(0), limit.to(low.dtype)).long()
     high = torch.minimum(high.clamp_min(-1), limit.to(low.dtype) - 1).long()
     boxes = torch.cat([low, (high - low + 1).clamp_min(0)], dim=-1)
@@ -106,4 +105,4 @@ def _meets(projection: Projection, rows: Tensor, tile_x: Tensor, tile_y: Tensor)
     on_column = form(near_x, torch.minimum(torch.maximum(b / a * near_x, top), bottom))
     on_row = form(torch.minimum(torch.maximum(b / c * near_y, left), right), near_y)
     reach = 2 * torch.log(projection.opacities[rows] / ALPHA_MIN)
-    return torch.minimum(on_column, on_row) <= reach * (1 + _SLACK) + _SLACK
+    return torch.minimum(on_column, on_row) <= reach * (1 + CULL_SLACK) + CULL_SLACK

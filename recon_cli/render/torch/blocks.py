@@ -26,7 +26,7 @@ _PAIRS = {"cpu": 1 << 18, "cuda": 1 << 25}  # pairs a block: the second-level ca
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class TileTable:
     """The inputs of the blocks, one row a Gaussian; the last row is empty and pads short lists."""
 
     means2d: Tensor  # [M+1, 2] float64 centres, so that offsets from a far centre keep their digits
@@ -70,11 +70,11 @@ def build_table(
     det: Tensor,  # [M]
     log_o: Tensor,  # [M]
     channels: Tensor,  # [M, 4]
-) -> Table:
+) -> TileTable:
     """Returns the table of M projected Gaussians with its empty last row."""
     whitening = whitening_factors(cov2d, det)
     ones = torch.ones_like(log_o)[:, None]
-    return Table(
+    return TileTable(
         torch.nn.functional.pad(means2d.double(), (0, 0, 0, 1)),
         torch.nn.functional.pad(whitening, (0, 0, 0, 1)),
         torch.nn.functional.pad(log_o, (0, 1), value=-torch.inf),
@@ -139,7 +139,7 @@ def pixel_monomials(like: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def whitening_of(table: Table, block: TileBlock, tiles_x: int) -> Tensor:
+def whitening_of(table: TileTable, block: TileBlock, tiles_x: int) -> Tensor:
     """Returns [n, K, 5]: u = k0 + k1 x + k2 y and v = k3 + k4 y at offsets from the tile centre."""
     l11, l12, l22 = table.whitening[block.rows].unbind(-1)
     center_x = (block.tiles % tiles_x) * TILE + TILE / 2
@@ -150,7 +150,7 @@ def whitening_of(table: Table, block: TileBlock, tiles_x: int) -> Tensor:
 
 
 def alphas(
-    table: Table, block: TileBlock, affine: Tensor, monomials: Tensor, scratch: Scratch
+    table: TileTable, block: TileBlock, affine: Tensor, monomials: Tensor, scratch: Scratch
 ) -> Tensor:
     """Returns alpha [n, K, 256] after both thresholds: alpha = o exp(-q / 2).
 

@@ -41,13 +41,13 @@ def render(
     if min(sh_degree, splats.sh_degree) == 0:
         tensors[5] = tensors[5].detach()  # not used by the image
     counting = None if mask is None else mask.contiguous().to(torch.uint8)
-    rgb, alpha, depth = _Render.apply(
+    rgb, alpha, depth = _TritonRender.apply(
         background, camera, TERMS[min(sh_degree, splats.sh_degree)], scores, counting, statistics,
         *tensors)
     return RenderOutput(rgb, alpha, depth, statistics)
 
 
-class _Render(torch.autograd.Function):
+class _TritonRender(torch.autograd.Function):
     """All kernels of a view as one differentiable operation."""
 
     @staticmethod

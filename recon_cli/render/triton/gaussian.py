@@ -16,6 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from recon_cli.kernels.viewpoint import MARGIN
 from recon_cli.render.triton.compositing import LOG2E
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0
@@ -25,7 +26,6 @@ FX, FY, CX, CY = (tl.constexpr(place) for place in range(12, 16))
 LEFT, RIGHT, TOP, BOTTOM = (tl.constexpr(place) for place in range(16, 20))
 CENTER = tl.constexpr(20)  # and two more
 WIDTH, HEIGHT = tl.constexpr(23), tl.constexpr(24)
-_MARGIN = 0.15  # of the size on each side, where x/z and y/z are clamped (INRIA's 3DGS)
 C0 = tl.constexpr(SH_C0)
 C1 = tl.constexpr(0.4886025119029199)
 C20, C21, C22 = (tl.constexpr(c) for c in (
@@ -37,7 +37,7 @@ C30, C31, C32, C33, C34 = (tl.constexpr(c) for c in (
 
 def camera_buffer(camera: Camera, device: torch.device) -> Tensor:
     """Returns a camera as the numbers [25] that kernels read; the copy waits for nothing."""
-    margin_x, margin_y = _MARGIN * camera.width / camera.fx, _MARGIN * camera.height / camera.fy
+    margin_x, margin_y = MARGIN * camera.width / camera.fx, MARGIN * camera.height / camera.fy
     numbers = torch.from_numpy(np.concatenate([
         camera.viewmat[:3, :3].ravel(), camera.viewmat[:3, 3],
         [camera.fx, camera.fy, camera.cx, camera.cy,

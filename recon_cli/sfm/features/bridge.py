@@ -42,7 +42,6 @@ MIN_INLIERS, MIN_INLIER_SHARE, MAX_OFF_PX = 30, 0.3, 2.0
 # SIFT's own matches that must lie on the geometry, and their share: 0 of 13 pairs are false so.
 MIN_AGREEING, MIN_AGREEING_SHARE = 6, 0.2
 MIN_COSINE = 0.82  # of two learned descriptors (paper)
-MAX_SIFT_ANGLE, MAX_SIFT_RATIO = 0.7, 0.8  # radians between descriptors, and to the next (COLMAP)
 
 Rows = NDArray[np.int64]  # [M, 2] rows of keypoints in two images
 
@@ -198,8 +197,8 @@ def find_bridge(
 
 def match_sift(similarity: NDArray[np.float32]) -> Rows:
     """Returns the mutual nearest neighbours by products [N, M] of SIFT descriptors (COLMAP)."""
-    return match_rows(similarity, least=float(np.cos(MAX_SIFT_ANGLE)) * DESCRIPTOR_SCALE**2,
-                      ratio=MAX_SIFT_RATIO)
+    return match_rows(similarity, least=float(np.cos(matching.MAX_ANGLE)) * DESCRIPTOR_SCALE**2,
+                      ratio=matching.MAX_RATIO)
 
 
 def match_rows(

@@ -21,10 +21,9 @@ from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.mapping import checks
 from recon_cli.sfm.results import FeaturesResult
 
-# COLMAP's values but for the contrast, a difference of Gaussians times the number of layers: at its
-# value of .02 OpenCV finds a tenth fewer, at STRONG as many. In dim frames the strongest USUAL are
-# kept, down to CONTRAST.
-LAYERS, EDGE_RATIO, SIGMA = 3, 10.0, 1.6
+# OpenCV's other values are COLMAP's. The contrast is a difference of Gaussians times the number of
+# layers: at COLMAP's .02 OpenCV finds a tenth fewer, at STRONG as many. In dim frames the strongest
+# USUAL are kept, down to CONTRAST.
 STRONG, CONTRAST, USUAL = 0.0133, 0.0067, 1000
 # An image is reduced by powers of two, to this many pixels of the longer side or more, where that
 # leaves this share of the features that are wanted at most: these are the coarsest, and found in a
@@ -75,7 +74,7 @@ def _read(job: MappingJob, name: str) -> tuple[NDArray[np.uint8], NDArray[np.uin
 
 def _make_sift() -> cv2.SIFT:
     return cv2.SIFT.create(
-        0, LAYERS, CONTRAST, EDGE_RATIO, SIGMA, cv2.CV_32F, enable_precise_upscale=True)
+        contrastThreshold=CONTRAST, enable_precise_upscale=True)
 
 
 def find_on_faces(
@@ -112,7 +111,7 @@ def _find_on_faces(
     for face, warp in cube_warps(*size):
         image, counts = cut_face(gray, warp), cut_face(mask, warp) == 255
         points, rows = sift.compute(
-            image, _strongest(sift.detect(image, np.uint8(255) * counts * warp.own)))
+            image, _strongest(sift, sift.detect(image, np.uint8(255) * counts * warp.own)))
         if not len(points):
             continue
         pixels = np.array([point.pt for point in points]) + 0.5 - warp.side / 2
@@ -141,7 +140,7 @@ def _find(job: MappingJob, name: str) -> tuple[NDArray[np.float32], NDArray[np.u
         image = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         # a reduced pixel counts where all that it covers do
         counts = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) == 255
-        points = _strongest(sift.detect(image, np.uint8(255) * counts))
+        points = _strongest(sift, sift.detect(image, np.uint8(255) * counts))
         if len(points) >= ENOUGH_FEATURES * job.max_features:
             break
     points.sort(key=lambda point: -point.size)
@@ -169,8 +168,9 @@ def _root_sift(lowe: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.rint(DESCRIPTOR_SCALE * root), 0, 255), np.uint8)
 
 
-def _strongest(points: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
+def _strongest(sift: cv2.SIFT, points: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
     """Returns the keypoints of STRONG contrast, and at least the USUAL strongest."""
     response = np.array([point.response for point in points])
-    bound = min(STRONG / LAYERS, np.sort(response)[-min(USUAL, len(points)):][:1].sum())
+    usual = np.sort(response)[-min(USUAL, len(points)):][:1].sum()
+    bound = min(STRONG / sift.getNOctaveLayers(), usual)
     return [point for point in points if point.response >= bound]

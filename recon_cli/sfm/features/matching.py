@@ -10,14 +10,14 @@ COLMAP's, takes as long and loses 2.5% of them.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import FormatError, list_names
+from recon_cli.errors import FormatError, Hint, list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database
 from recon_cli.sfm.database import scales
@@ -81,7 +81,7 @@ def _check_readable(job: MappingJob, readable: Collection[str]) -> None:
         raise FormatError(
             f"{len(missing)} of {len(job.names)} frames cannot be read or differ from the first in "
             f"size: {list_names(missing)}.",
-            hint="Run `recon ingest --again`.")
+            hint=Hint("ingest", again=True))
 
 
 def first_model(job: MappingJob, group: CameraGroup) -> str:
@@ -266,6 +266,18 @@ def verify_pairs(job: MappingJob, pairs: Iterable[Pair]) -> None:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         matches = {pair: opened.read_matches(*(ids[name] for name in pair)) for pair in listed}
         _write_geometries(job, opened, listed, matches, lambda _: None)
+
+
+def read_matched_pixels(
+    path: Path, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]
+) -> Iterator[tuple[Pair, NDArray[np.float64], NDArray[np.float64]]]:
+    """Yields pairs with where their verified matches lie in either image, [M, 2] pixels each."""
+    with pycolmap.Database.open(path) as opened:
+        pixels = {image.name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+                  for image in opened.read_all_images()}
+    for (first, second), geometry in geometries.items():
+        ours, theirs = geometry.inlier_matches.T
+        yield (first, second), pixels[first][ours], pixels[second][theirs]
 
 
 def _write_geometries(

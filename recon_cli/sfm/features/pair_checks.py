@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm.features.matching import Pair
+from recon_cli.sfm.features.matching import Pair, read_matched_pixels
 from recon_cli.sfm.limits import (
     MAX_DRIFT,
     MAX_DRIFT_DEG,
@@ -18,12 +18,12 @@ from recon_cli.sfm.limits import (
     MAX_TRIALS,
     MIN_PAIR_EXPLAINED,
 )
+from recon_cli.sfm.model_arrays import ModelArrays
 from recon_cli.sfm.verdict.evidence import (
     explained_matches,
     inverse_depths,
     lift_rays,
     nearest_depth,
-    seen_depths,
 )
 
 NEAR_FRAMES = 3  # frames; a loop is closed by more than one pair of near frames
@@ -45,17 +45,11 @@ def check_pairs(
 ) -> PairChecks:
     """Returns which verified pairs of a database agree with the cameras of views, by name."""
     agreeing, drifted, contradicting, unplaced = set(), set(), set(), set()
-    with pycolmap.Database.open(path) as opened:
-        keypoints = {
-            image.name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
-            for image in opened.read_all_images()}
-    for pair, geometry in geometries.items():
+    for pair, ours, theirs in read_matched_pixels(path, geometries):
         first, second = (views.get(name) for name in pair)
         if first is None or second is None or first.group != second.group:
             unplaced.add(pair)
             continue
-        ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
-                        for side, name in enumerate(pair))
         explained = explained_matches(
             first.image, ours, second.image, theirs, first.near, MAX_ERROR_PX)
         if explained.mean() >= MIN_PAIR_EXPLAINED:
@@ -90,21 +84,20 @@ def list_models(models: Sequence[pycolmap.Reconstruction]) -> dict[str, PlacedVi
     """Returns the images of models by name, each model in its own frame; the first one wins."""
     views: dict[str, PlacedView] = {}
     for index, model in reversed(list(enumerate(models))):
-        names = frozenset(model.image(number).name for number in model.reg_image_ids())
-        views |= list_views([(model, names)], group=index)
+        views |= list_views([(model, None)], group=index)
     return views
 
 
 def list_views(
-    parts: Sequence[tuple[pycolmap.Reconstruction, Collection[str]]], *, group: int = 0
+    parts: Sequence[tuple[pycolmap.Reconstruction, Collection[str] | None]], *, group: int = 0
 ) -> dict[str, PlacedView]:
-    """Returns images of models that lie in one frame, those named from each, by name."""
+    """Returns images of models that lie in one frame, those named from each or all, by name."""
     found: list[tuple[pycolmap.Image, float, float]] = []
     for model, names in parts:
-        places = {number: point.xyz for number, point in model.points3D.items()}
-        for image in (model.image(number) for number in model.reg_image_ids()):
-            if image.name in names:
-                depths = seen_depths(image, places)
+        arrays = ModelArrays.from_model(model)
+        for row, image in enumerate(arrays.images):
+            if names is None or image.name in names:
+                depths = arrays.depths(row)
                 usual = float(np.median(depths)) if len(depths) else 0.0
                 found.append((image, nearest_depth(depths), usual))
     views: dict[str, PlacedView] = {}

@@ -35,8 +35,6 @@ _LINEAR = {"skip1.1": (1, 24), "block_fusion.2": (64, 64), "heatmap_head.2": (64
            "keypoint_head.3": (64, 65)}
 _CELL = 8  # pixels; of the keypoints in each cell the network gives probabilities
 _STRIDE = 32  # pixels; the coarsest level has one cell for so many
-_EPSILON = 1e-5  # of the normalizations: torch's default, with which they were trained
-DESCRIPTOR_SIZE = 64
 
 # The longer side of the image that the network sees, in pixels, and how much smaller ones are
 # enlarged for it: rooms of 600 px gave matches .35 px off so, .43 px as they are.
@@ -97,7 +95,7 @@ class Network:
             layer = f"{name}.{index}.layer"
             x = F.conv2d(x, self._weights[f"{layer}.0.weight"], stride=stride, padding=kernel // 2)
             x = F.relu(F.batch_norm(x, self._weights[f"{layer}.1.running_mean"],
-                                    self._weights[f"{layer}.1.running_var"], eps=_EPSILON))
+                                    self._weights[f"{layer}.1.running_var"]))
         return x
 
     def _linear(self, x: Tensor, name: str) -> Tensor:

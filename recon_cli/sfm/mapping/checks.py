@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from recon_cli.errors import SfmError, list_names
+from recon_cli.errors import SfmError, list_names, name_command
 from recon_cli.sfm.limits import MAX_FLAT_SHARE, MIN_FRAMES, MIN_PAIR_INLIERS, MIN_PARALLAX_DEG
 
 _MOVE = (
@@ -38,7 +38,7 @@ def check_motion(pairs: int, matches: int, flat: int) -> None:
         raise SfmError(
             "No two frames match.",
             hint="Use more frames of one room, so that neighbours overlap by two thirds: "
-            "`recon ingest --frames N`.")
+            f"{name_command('ingest --frames N')}.")
     if flat > MAX_FLAT_SHARE * matches:
         raise SfmError(
             f"The camera did not move, or sees only one flat surface: {flat / matches:.0%} of the "
@@ -57,7 +57,8 @@ def check_registered(
     raise SfmError(
         f"Only {len(registered)} of {len(names)} frames have a camera, but at least {needed} are "
         f"needed. Missing: {list_names(missing)}.",
-        hint="Use more frames, so that neighbours overlap (`recon ingest --frames N`), match all "
+        hint=f"Use more frames, so that neighbours overlap ({name_command('ingest --frames N')}), "
+        "match all "
         "of them (--pairs exhaustive), or accept a part of the room with a lower --min-registered.")
 
 

@@ -17,11 +17,11 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 
-from recon_cli.errors import SfmError
+from recon_cli.errors import SfmError, name_command
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching, xfeat_weights
-from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import (
     ENOUGH_FRAMES,
     FEW_PAIR_MATCHES,
@@ -33,6 +33,7 @@ from recon_cli.sfm.mapping import checks, mapper, merge_models, parts, skeleton,
 from recon_cli.sfm.mapping.merge_models import ModelCandidate
 from recon_cli.sfm.mapping.time_estimate import COSTS, format_minutes
 from recon_cli.sfm.mapping.trusted_part import cuts_models, deliver_parts
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.segments import join_segments
 from recon_cli.sfm.verdict.verdict import ModelVerdict, examine
@@ -153,19 +154,19 @@ def build_model(job: MappingJob, report: Reporter) -> ModelResult:
     SfmError if too few frames have a camera, they see the points from one place,
     or the parts of the model are too weakly connected.
     """
-    log = StepLog(job.attempts)
+    log = job.tried
     attempts: list[MapperAttempt] = []
     verdicts: dict[str, ModelVerdict] = {}  # of the attempts of this call
     ways = list(_begin_with_fisheye(job, list_fallbacks(job), report))
     reason = ways[0].reason
     while ways:
         fallback = ways.pop(0)
-        attempt = log.result(fallback.name, MapperAttempt)
+        attempt = log.find(fallback.name, MapperAttempt)
         if attempt is None:
             attempt, candidate = _try_fallback(job, fallback, reason, attempts, report)
             if candidate is not None:
                 verdicts[fallback.name] = candidate.verdict
-            log.finish(fallback.name, attempt, job.attempts / fallback.name)
+            log.finish(fallback.name, attempt, [job.attempts / fallback.name])
         attempts.append(attempt)
         if not attempt.skipped:
             bridge = _with_bridge(job, attempts, ways, report)
@@ -211,8 +212,8 @@ def _begin_with_fisheye(
     if job.segments:
         if all(group.model == "auto" for group in job.groups):
             report.tell("The matches are those of a fisheye lens, but the segments were mapped "
-                        "with ordinary ones: `recon sfm --segments off` maps them together, and "
-                        "as fisheyes.")
+                        f"with ordinary ones: {name_command('sfm --segments off')} maps them "
+                        "together, and as fisheyes.")
         return ways
     named = any("FISHEYE" in group.model for group in job.groups)
     reason = "--camera-model asks for it" if named else "the matches are those of a fisheye lens"
@@ -245,7 +246,8 @@ def _with_bridge(
         return None
     if not xfeat_weights.are_installed():
         report.tell("These photos are few or far apart. Learned features may match them where SIFT "
-                    f"cannot: `{xfeat_weights.COMMAND}` gets them, then run `recon sfm --again`.")
+                    f"cannot: `{xfeat_weights.COMMAND}` gets them, then run "
+                    f"{name_command('sfm --again')}.")
         return None
     from recon_cli.sfm.features import bridge  # imports torch
 
@@ -278,7 +280,7 @@ def list_thin(model: pycolmap.Reconstruction) -> tuple[str, ...]:
     by images with 44 and more such points.
     """
     firm = {number for number, point in model.points3D.items() if point.track.length() > 2}
-    images = [model.image(number) for number in model.reg_image_ids()]
+    images = registered_images(model)
     thin = sorted(image.name for image in images if sum(
         point.point3D_id in firm for point in image.get_observation_points2D()) < FEW_PAIR_MATCHES)
     return tuple(thin) if len(thin) > (1 - ENOUGH_FRAMES) * len(images) else ()
@@ -374,7 +376,7 @@ def _try_fallback(
         return MapperAttempt(fallback.name, reason, skipped=skipped), None
     if wanted:
         matching.match_pairs(job, wanted, report)
-        database.seal(job.database)
+        database.record_rows(job.database)
     job = _with_own_matches(job, fallback.name)
     candidate = merge_models.best_model(
         job, fallback.find_models(job, report), merging=fallback.name != SEGMENTS,

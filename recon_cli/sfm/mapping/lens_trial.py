@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.sfm.limits import MAX_ERROR_PX, MIN_TRACK_LENGTH
 from recon_cli.sfm.mapping import mapper
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.workspace.json_record import JsonRecord
 
 # The models that are tried. FULL_OPENCV gained .3% at most over the better of the last two.
@@ -30,10 +32,8 @@ CLEARLY, SIGMAS = 0.05, 3.0
 # only those get who ask for it, lost 6% at most in the 20 captures.
 WRONG = 0.10
 LEAST_PX = 0.02  # that it must take away: features are not found more exactly
-LEAST_TRACK = 3  # observations of a point; two rays meet in whatever way
 LEAST_POINTS, LEAST_IMAGES = 100, 5  # that are judged; fewer decide nothing
 MOST_IMAGES = 40  # of a camera; they show a lens as well as all
-WRONG_PX = 4.0  # from which on an observation is wrong, and its error counts no more
 _GRID = 15  # pixels a side, by which a camera is put into another model
 _EVALUATIONS = 60  # of that fit
 
@@ -67,8 +67,7 @@ class BetterLens(JsonRecord):
     def sentence(self) -> str:
         """Returns what is wrong, and what to type."""
         text = self.describe()
-        return (f"{text[:1].upper()}{text[1:]}: `recon sfm --camera-model {self.better}` uses "
-                "that.")
+        return f"{text[:1].upper()}{text[1:]}: --camera-model {self.better} uses that."
 
 
 def find_better_lenses(
@@ -144,7 +143,7 @@ def convert(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
 def _middle(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Returns a model with the images in the middle of each camera's alone, in order of names."""
     images: dict[int, list[pycolmap.Image]] = {}
-    every = [model.image(number) for number in model.reg_image_ids()]
+    every = registered_images(model)
     for image in sorted(every, key=lambda each: each.name):
         images.setdefault(image.camera_id, []).append(image)
     rest = []
@@ -160,7 +159,7 @@ def _middle(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def _left_out(model: pycolmap.Reconstruction) -> list[int]:
     """Returns the points that are left out: every second one of those that enough images see."""
     return [number for number, point in sorted(model.points3D.items())
-            if point.track.length() >= LEAST_TRACK][::2]
+            if point.track.length() >= MIN_TRACK_LENGTH][::2]
 
 
 def _fit(
@@ -192,13 +191,13 @@ def _judge(
     squares: dict[int, list[float]] = {number: [] for number in cameras}
     for image_id in sorted(fitted.reg_image_ids()):
         image = fitted.image(image_id)
-        spots = [spot for spot in image.points2D if spot.has_point3D()]
+        spots = image.get_observation_points2D()
         if image.camera_id not in squares or not spots:
             continue
         pose = image.cam_from_world().matrix()
         places = np.array([fitted.point3D(spot.point3D_id).xyz for spot in spots])
         pixels = np.asarray(image.camera.img_from_cam(places @ pose[:, :3].T + pose[:, 3]))
         off = np.linalg.norm(pixels - np.array([spot.xy for spot in spots]), axis=1)
-        off = np.minimum(np.nan_to_num(off, nan=WRONG_PX), WRONG_PX)
+        off = np.minimum(np.nan_to_num(off, nan=MAX_ERROR_PX), MAX_ERROR_PX)
         squares[image.camera_id].append(float((off**2).mean()))
     return {number: np.array(each) for number, each in squares.items()}

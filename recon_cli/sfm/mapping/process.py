@@ -18,13 +18,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from recon_cli.errors import ExitCode, ReconError, SfmError, format_count
+from recon_cli.errors import ExitCode, ReconError, SfmError, format_count, name_command
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
 from recon_cli.sfm.job import (
     LOCK,
-    LOG_FILE,
     PLACED,
     POLL_SECONDS,
     Event,
@@ -35,7 +34,7 @@ from recon_cli.sfm.job import (
 )
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.disk import refuse_full_disk
-from recon_cli.workspace.journal import make_way
+from recon_cli.workspace.steps import make_way
 from recon_cli.workspace.summaries import PlacedPart
 
 _DOING = {
@@ -145,7 +144,7 @@ def run_job(
     try:
         _run(job, job.max_minutes, Monitor(job, progress, record, on_idle))
     except TimeUpError as error:
-        if not (job.attempts / LOG_FILE).is_file():
+        if not job.tried.steps:
             raise
         logger.warning("sfm: %s The best model so far is taken.", error.message)
         _run(replace(job, max_minutes=0.0), job.max_minutes,
@@ -196,7 +195,7 @@ def _run(job: MappingJob | PlaceJob, max_minutes: float, monitor: Monitor) -> No
     except BaseException:
         if isinstance(job, MappingJob) and monitor.doing != "starting":
             with suppress(OSError):  # the error that led here says more
-                database.seal(job.database)  # what was found before has been checked
+                database.record_rows(job.database)  # what was found before has been checked
         raise
     finally:
         for leftover in (file, job.out / LOCK):
@@ -248,7 +247,7 @@ def _timeout_error(max_minutes: float, monitor: Monitor) -> TimeUpError:
         f"The cameras were not found within {max_minutes:g} minutes; the last step was "
         f"{monitor.doing}.",
         hint="Allow more time with --max-minutes (features and matches found so far are kept), or "
-        "use fewer frames (`recon ingest --frames N`) or --max-features 1024.")
+        f"use fewer frames ({name_command('ingest --frames N')}) or --max-features 1024.")
 
 
 def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
@@ -259,7 +258,7 @@ def _crash_error(log: Path, code: int, monitor: Monitor) -> CrashError:
     if code == ExitCode.SIGNAL - ExitCode.KILLED:
         hint = (
             "The system may have run out of memory; try --max-features 1024 or fewer frames "
-            "(`recon ingest --frames N`).")
+            f"({name_command('ingest --frames N')}).")
     return CrashError(
         f"The mapping process {how} while it was {monitor.doing}. The last error in {log}: "
         f"{last_error(log)}", hint=hint)

@@ -16,9 +16,11 @@ import cv2
 import numpy as np
 
 # Seconds of the piece of work on the machine of `COSTS`, on a core that has nothing else to do.
-PIECE_SECONDS = 0.015
+PIECE_SECONDS = 0.0146
 MEASURES = 15
 BLURS = (1.6, 2.0, 2.5, 3.2, 4.0, 5.0)
+# Of float32 products, as in matching. No BLAS shares one of 64 x 64 among threads of its own.
+PRODUCTS = (512, 64, 64)
 LEAST_NOTICE = 60.0  # seconds that are worth a notice
 
 
@@ -48,10 +50,11 @@ class Costs:
     join: float  # to join segments; of one core
 
 
-# Fitted to the seconds of two idle cores and of long walks in tests/bench/notes/cameras.md.
+# On a CPU with AVX2. Of walks: fitted to nine (tests/bench/notes/cameras.md). The others: those
+# of a CPU with AVX-512, which takes 1.6 times less; no set of photos has been timed on this one.
 COSTS = Costs(
-    walk=0.12, walk_megapixel=0.48, keyframe=0.34, walk_mapping=0.15,
-    photo=0.28, photo_megapixel=0.38, photo_mapping=0.17, split=1.0, join=0.2)
+    walk=0.087, walk_megapixel=1.192, keyframe=0.383, walk_mapping=0.158,
+    photo=0.45, photo_megapixel=0.61, photo_mapping=0.27, split=1.6, join=0.32)
 OVERLAP_SHARE = 1 / 6  # of a segment's frames, which are mapped in the next one as well
 
 
@@ -85,13 +88,16 @@ def expected_seconds(
 
 def measure_slowness(threads: int) -> float:
     """Returns how many times as long this machine takes now as that of COSTS, on all threads."""
-    image = np.random.default_rng(0).random((480, 640), np.float32)
+    generator = np.random.default_rng(0)
+    image = generator.random((480, 640), np.float32)
+    rows = generator.random(PRODUCTS, np.float32)
 
     def take(_: int) -> float:
         start = time.monotonic()
         for sigma in BLURS:  # as for the octaves of features
             cv2.GaussianBlur(image, (0, 0), sigma)
         np.sort(image.ravel())
+        np.matmul(rows, rows)
         return time.monotonic() - start
 
     before = cv2.getNumThreads()

@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from recon_cli.errors import SfmError
+from recon_cli.errors import MOST_NAMED, SfmError, name_command
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.job import MappingJob
 from recon_cli.sfm.limits import MIN_FRAMES, MIN_IMAGES_PRINCIPAL, MIN_PARALLAX_DEG
@@ -34,7 +34,6 @@ Names = tuple[str, ...]
 # Frames of a part beside the largest, a tenth of the capture within these bounds: 20 are worth a
 # scene, and fewer than 10 cannot tell the principal point (`limits`).
 FEWEST_FRAMES, WORTH_FRAMES = MIN_IMAGES_PRINCIPAL, 20
-_MOST_NAMED = 5  # parts in an error
 JOIN_PANORAMAS = (
     "To join panoramas that do not overlap, add some between them, half a metre apart: in a "
     "doorway and on either side of it.")
@@ -156,9 +155,9 @@ def _check_share(
     if parts and (count >= job.min_registered * len(asked) or not broken):
         return
     more = JOIN_PANORAMAS if job.panoramas else (
-        "Use more frames between the parts (`recon ingest --frames N`), or match all of them "
-        "(--pairs exhaustive).")
-    named = "; ".join(f"{len(names)} ({names[0]} to {names[-1]})" for names in held[:_MOST_NAMED])
+        f"Use more frames between the parts ({name_command('ingest --frames N')}), or match all "
+        "of them (--pairs exhaustive).")
+    named = "; ".join(f"{len(names)} ({names[0]} to {names[-1]})" for names in held[:MOST_NAMED])
     problem = (verdict.problems or ("The capture split into disconnected models.",))[0]
     raise SfmError(
         f"{problem} The parts that can be trusted on their own hold {count} of {len(asked)} "

@@ -23,15 +23,7 @@ from recon_cli.errors import ReconError, WorkspaceError
 from recon_cli.processes import end_with_parent
 from recon_cli.sfm import database
 from recon_cli.sfm.features import matching
-from recon_cli.sfm.job import (
-    LOCK,
-    LOG_FILE,
-    SPLIT,
-    MappingJob,
-    PlaceJob,
-    Reporter,
-    StepLog,
-)
+from recon_cli.sfm.job import LOCK, ORDER, SPLIT, MappingJob, PlaceJob, Reporter
 from recon_cli.sfm.mapping import fallbacks
 from recon_cli.sfm.poses import known_poses
 from recon_cli.sfm.results import RESULTS, CountedResult, StepResult
@@ -40,6 +32,7 @@ from recon_cli.sfm.views import undistort
 from recon_cli.signals import leave_to_parent
 from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.disk import find_space_errno
+from recon_cli.workspace.steps import StepFolder
 
 LOCK_SECONDS = 30.0  # an orphan of a killed run is gone within a second or two
 
@@ -55,64 +48,66 @@ def work(job: MappingJob, report: Reporter) -> None:
         "model": lambda: (
             known_poses.build_known_model if job.known_poses else fallbacks.build_model)(
                 job, report)}
-    log = StepLog(job.out)
+    log = StepFolder(job.out)
     rematch = _forget_damaged(job, log, report)
     mapped = not job.is_segment and log.is_finished("model")
     if "features" in job.steps and not mapped:  # else nothing reads it any more
         _prepare_database(job, log, report, rematch=rematch)
     for step in job.steps:
-        if log.result(step, RESULTS[step]) is not None:
+        if log.find(step, RESULTS[step]) is not None:
             continue
-        log.forget_from(step)
-        if step in ("features", "matches"):  # the models of finished attempts build on these
-            (job.attempts / LOG_FILE).unlink(missing_ok=True)
+        _forget_from(log, step)
         start, cpu = time.monotonic(), time.process_time()
         found = actions[step]()
         result = replace(found, seconds=round(time.monotonic() - start, 2),
                          cpu_seconds=round(time.process_time() - cpu, 2))
         if step in ("features", "matches"):
-            database.seal(job.database)
-        is_model = step == "model"
-        log.finish(step, result, job.parts if is_model else None,
-                   (join_segments.REPORT,) if is_model else ())
+            database.record_rows(job.database)
+        log.finish(step, result, (
+            job.parts, job.out / join_segments.REPORT) if step == "model" else ())
 
 
-def _forget_damaged(job: MappingJob, log: StepLog, report: Reporter) -> bool:
+def _forget_from(log: StepFolder, step: str) -> None:
+    """Takes back a step and all that build on it."""
+    log.forget(*ORDER[ORDER.index(step):])
+
+
+def _forget_damaged(job: MappingJob, log: StepFolder, report: Reporter) -> bool:
     """Forgets finished steps whose files were damaged since, and what builds on them.
 
     Returns whether all matches must be found anew.
     """
     step = log.find_damage()
-    if step is not None:
+    if step:
         report.tell(f"unfinished work is damaged: {step} is made anew")
-        log.forget_from(step)
-    if step == "model" or StepLog(job.attempts).find_damage() is not None:
+        _forget_from(log, step)
+    if step == "model" or job.tried.find_damage():
         shutil.rmtree(job.attempts, ignore_errors=True)
-        log.forget_from("matches")
+        _forget_from(log, "matches")
         # later attempts may have added pairs, with which the first ones would find other models
         return True
     return False
 
 
 def _prepare_database(
-    job: MappingJob, log: StepLog, report: Reporter, *, rematch: bool
+    job: MappingJob, log: StepFolder, report: Reporter, *, rematch: bool
 ) -> None:
     """Keeps the database of an interrupted run where it is intact, else starts a new one."""
     sound = database.is_sound(job.database, job.names, len(job.groups))
-    damaged = database.keep_sealed(job.database) if sound else "features"
+    damaged = database.restore_rows(job.database) if sound else "features"
     if damaged and log.is_finished(damaged):
         report.tell(f"unfinished work is damaged: {damaged} are found anew")
     if damaged == "features":
-        log.forget_from("features")
+        _forget_from(log, "features")
         matching.create_database(job)
     elif damaged or rematch:
-        log.forget_from("matches")
+        _forget_from(log, "matches")
         database.clear_matches(job.database)
     for step in ("features", "matches"):
-        result = log.result(step, CountedResult)
+        result = log.find(step, CountedResult)
         # Further attempts add pairs.
         if result is not None and result.rows > database.progress(job.database, step):
-            log.forget_from(step)
+            _forget_from(log, step)
 
 
 def _take_stdout() -> BinaryIO:

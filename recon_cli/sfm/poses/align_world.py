@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import SfmError
-from recon_cli.io.colmap import Pinhole
+from recon_cli.errors import SfmError, name_command
 from recon_cli.room.scale import (
     ARBITRARY,
     DATA_SET,
@@ -36,6 +35,7 @@ from recon_cli.room.scale_fusion import (
     fuse,
     fuse_measured,
 )
+from recon_cli.scene.camera import Lens
 from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.records import find_frames
@@ -78,12 +78,13 @@ def world_transform(
     points: NDArray[np.float64],  # [P, 3] sparse points in the mapper's frame
     viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera of each frame
     *,
-    gravity: bool,  # find up; False leaves the axes and the origin
+    # [C, 4, 4] views whose x axes are held level, to find up by; None leaves axes and origin
+    level_views: NDArray[np.float64] | None,
     scale_between: ScaleBetween | None,
     metric: bool,  # the mapper's units are metres, as in a data set with measured poses
     sources: Sequence[ScaleSource] = (),  # what else tells the scale, in the order of trust
     given_up: tuple[float, float, float] | None = None,  # unit vector that a data set knows
-    pinholes: Mapping[str, Pinhole] | None = None,  # of undistorted frames, for FRAME:u,v
+    pinholes: Mapping[str, Lens] | None = None,  # of undistorted frames, for FRAME:u,v
 ) -> WorldFrame:
     """Returns the world frame of a model.
 
@@ -94,10 +95,10 @@ def world_transform(
     """
     names = sorted(viewmats)
     matrices = np.array([viewmats[name] for name in names]).reshape(-1, 4, 4)
-    up = (find_gravity(points, matrices) if gravity and given_up is None
+    up = (find_gravity(points, level_views) if level_views is not None and given_up is None
           else Gravity(None, None, None, "it was not looked for"))
     turn, axis, strength = Similarity(), "mapper", None
-    if gravity and given_up is not None:
+    if level_views is not None and given_up is not None:
         given = np.array(given_up)
         up = Gravity(given, None, None)
         turn, axis = Similarity(rotation=turn_onto(given, np.array([0.0, 0.0, 1.0]))), "data set"
@@ -116,7 +117,8 @@ def world_transform(
     evidence = _evidence(up, axis, strength, source, fused)
     return WorldFrame(
         Similarity(scale=fused.scale or 1.0 if fused else 1.0).after(turn), evidence, measured,
-        (*_describe_up(evidence, gravity), *_describe_scale(source, measured, fused)))
+        (*_describe_up(evidence, level_views is not None),
+         *_describe_scale(source, measured, fused)))
 
 
 def refuse_contradiction(evidence: WorldEvidence, *, accepted: bool) -> None:
@@ -127,7 +129,7 @@ def refuse_contradiction(evidence: WorldEvidence, *, accepted: bool) -> None:
     raise SfmError(
         f"What tells the scale contradicts itself, so that no length would be right: {told}.",
         hint="Name a length that you measured with --scale-between A B METRES; or type "
-        "`recon sfm --accept-weak` for a scene in an arbitrary scale.")
+        f"{name_command('sfm --accept-weak')} for a scene in an arbitrary scale.")
 
 
 def _name_source(fused: FusedScale | None) -> str:

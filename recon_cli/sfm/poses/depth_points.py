@@ -16,11 +16,13 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.depth_maps import (
     DepthMap,
     find_edges,
+    find_visible,
     lens_camera,
     read_depth_list,
     read_sure_depth,
 )
 from recon_cli.io.images import read_png
+from recon_cli.sfm.model_arrays import registered_images
 
 MOST_MAPS = 100  # evenly spread
 SAMPLES = 8000  # of each map
@@ -42,7 +44,7 @@ def add_depth_points(
     FormatError if a map or frame is damaged.
     """
     maps = {name: one for name, one in read_depth_list(ingest).items() if name not in without}
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    images = {image.name: image for image in registered_images(model)}
     names = sorted(set(maps) & set(images))
     count = min(len(names), MOST_MAPS)
     clouds = [
@@ -73,11 +75,9 @@ def _unproject(
     rays = np.asarray(lens_camera(one.lens).cam_from_img(np.column_stack([columns, rows]) + 0.5))
     local = np.column_stack([rays.reshape(-1, 2) * z[:, None], z])
     rgb = read_png(frames / image.name)
-    pixels = np.nan_to_num(np.asarray(image.camera.img_from_cam(local)).reshape(-1, 2), nan=-1)
-    inside = ((pixels >= 0) & (pixels < (rgb.shape[1], rgb.shape[0]))).all(axis=1)
-    x, y = pixels[inside].astype(np.intp).T
-    world = np.asarray(image.cam_from_world().inverse() * local[inside])
-    return world.reshape(-1, 3), rgb[y, x], z[inside]
+    seen, column, line = find_visible(image.camera, local)
+    world = np.asarray(image.cam_from_world().inverse() * local[seen])
+    return world.reshape(-1, 3), rgb[line, column], z[seen]
 
 
 def _choose(

@@ -21,15 +21,17 @@ from recon_cli.errors import SfmError
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching
-from recon_cli.sfm.job import MappingJob, Reporter, StepLog, fresh_folder
+from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
 from recon_cli.sfm.mapping import checks, fallbacks, mapper, parts
 from recon_cli.sfm.mapping.merge_models import build_posed_model
+from recon_cli.sfm.model_arrays import viewmat_of
 from recon_cli.sfm.poses import tracked_poses
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.verdict.evidence import gather_evidence
 from recon_cli.sfm.verdict.verdict import ModelVerdict, check_weak_link, examine
 from recon_cli.workspace.records import KnownPoses, read_poses
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import PosesSummary
 
 # Axes further apart share little: the wider side of a phone's picture spans 65 to 80 degrees.
@@ -112,7 +114,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     known = _read_poses(job)
     if job.pose_use == "keep":
         return _keep(job, known, report)
-    matched = StepLog(job.out).result("matches", MatchesResult)
+    matched = StepFolder(job.out).find("matches", MatchesResult)
     assert matched is not None, "matches come before the model"
     share = matched.poses_share
     if share is None or share >= MIN_SPOT_AGREEING:
@@ -166,7 +168,7 @@ def _start_from(
         model, job.database, names, sharpness=job.sharpness, times=job.times, given=True)
     check_weak_link(verdict, job.accept_weak, given=True)
     notes = tracked_poses.describe_tracked(found, len(verdict.model_parts))
-    tracked_poses.hold_rest(model, found.held, start)
+    tracked_poses.add_prior_poses(model, found.held, start)
     both = [name for name in mapper.list_registered(model) if name in start]
     given = np.stack([start[name] for name in both])
     model.transform(align_to_given(_viewmats(model, both), given))
@@ -284,10 +286,7 @@ def _uncalibrated_cameras(job: MappingJob) -> set[int]:
 
 
 def _viewmats(model: pycolmap.Reconstruction, names: Collection[str]) -> Poses:
-    matrices = np.tile(np.eye(4), (len(names), 1, 1))
-    for matrix, name in zip(matrices, names, strict=True):
-        matrix[:3] = model.find_image_with_name(name).cam_from_world().matrix()
-    return matrices
+    return np.array([viewmat_of(model.find_image_with_name(name)) for name in names])
 
 
 def _centers(viewmats: Poses) -> NDArray[np.float64]:

@@ -15,9 +15,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.io.depth_maps import MOST_NOISE, lens_camera, read_depth_list, read_sure_depth
+from recon_cli.io.depth_maps import (
+    LEAST_POINTS,
+    MOST_NOISE,
+    find_visible,
+    lens_camera,
+    read_depth_list,
+    read_sure_depth,
+)
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.sfm.job import PlaceJob
+from recon_cli.sfm.model_arrays import ModelArrays, registered_images
 from recon_cli.workspace.records import read_poses
 
 Viewmats = Mapping[str, NDArray[np.float64]]  # [4, 4] world to camera by name
@@ -35,7 +43,6 @@ TRACKED_ERROR, DEPTH_ERROR = 0.003, 0.005
 # share), or lengths by more than this share, in the median.
 MAX_TURN_DEG, MAX_TURN_SHARE, MAX_LENGTH_SHARE = 2.0, 0.1, 0.2
 MOST_DEPTH_MAPS = 40  # evenly spread
-FEWEST_DEPTHS = 20  # points of a frame
 _UNFIT = ("Sensor depth gives neither scale nor points: few points of the model have some, or it "
           "differs from them.")
 MAX_UP_SPREAD_DEG = 5.0  # median angle of up, by single frames, to the mean of all
@@ -180,26 +187,24 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
     map is damaged.
     """
     maps = read_depth_list(ingest)
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    names = sorted(set(maps) & set(images))
+    names = sorted(set(maps) & {image.name for image in registered_images(model)})
     count = min(len(names), MOST_DEPTH_MAPS)
+    arrays = ModelArrays.from_model(
+        model, [names[int((at + 0.5) * len(names) / count)] for at in range(count)])
     ratios, every = [], []
-    for name in (names[int((at + 0.5) * len(names) / count)] for at in range(count)):
-        one = maps[name]
-        depth = read_sure_depth(ingest, name, one)
-        pixels, ours = _seen_depths(model, images[name])
+    for index, image in enumerate(arrays.images):
+        one, ours = maps[image.name], arrays.depths(index)
+        depth = read_sure_depth(ingest, image.name, one)
+        pixels, ours = arrays.xy[arrays.observed(index)][ours > 0], ours[ours > 0]
         if not len(pixels):
             continue
-        rays = np.asarray(images[name].camera.cam_from_img(pixels))
-        at = np.asarray(lens_camera(one.lens).img_from_cam(
-            np.column_stack([rays, np.ones(len(rays))])))
-        at = np.nan_to_num(at, nan=-1.0)
-        inside = ((at >= 0) & (at < (one.lens.width, one.lens.height))).all(axis=1)
-        column, row = at[inside].astype(np.intp).T
-        theirs = depth[row, column].astype(np.float64)
+        rays = np.asarray(image.camera.cam_from_img(pixels))
+        rows, column, line = find_visible(
+            lens_camera(one.lens), np.column_stack([rays, np.ones(len(rays))]))
+        theirs = depth[line, column].astype(np.float64)
         known = theirs > 0
-        if known.sum() >= FEWEST_DEPTHS:
-            every.append(theirs[known] / ours[inside][known])
+        if known.sum() >= LEAST_POINTS:
+            every.append(theirs[known] / ours[rows][known])
             ratios.append(float(np.median(every[-1])))
     if len(ratios) < FEWEST_BLOCKS:
         return None
@@ -213,14 +218,3 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
     return ScaleSource(DEPTH, scale, float(np.hypot(error, DEPTH_ERROR)))
 
 
-def _seen_depths(
-    model: pycolmap.Reconstruction, image: pycolmap.Image
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the pixels [P, 2] and depths [P] of the points before a camera."""
-    seen = [point for point in image.points2D if point.has_point3D()]
-    if not seen:
-        return np.zeros((0, 2)), np.zeros(0)
-    points = np.array([model.point3D(point.point3D_id).xyz for point in seen])
-    depths = np.asarray(image.cam_from_world() * points)[:, 2]
-    ahead = depths > 0
-    return np.array([point.xy for point in seen])[ahead], depths[ahead]

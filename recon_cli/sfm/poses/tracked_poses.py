@@ -23,6 +23,7 @@ from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.limits import (
+    LOOP_CANDIDATES,
     MAX_ERROR_PX,
     MIN_POSE_INLIERS,
     MIN_SPOT_AGREEING,
@@ -35,7 +36,8 @@ from recon_cli.sfm.mapping.prior_adjustment import (
     make_points,
     measure_deviation,
 )
-from recon_cli.sfm.segments.loop_closure import bend_model
+from recon_cli.sfm.model_arrays import registered_images, viewmat_of
+from recon_cli.sfm.segments.loop_closure import optimize_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
 from recon_cli.sfm.verdict.evidence import explained_matches
 
@@ -44,7 +46,6 @@ Viewmats = Mapping[str, NDArray[np.float64]]  # [4, 4] world to camera by name
 # Pairs that are matched first, to see whether the poses fit: frames that follow each other by
 # name at these distances.
 STEPS = (1, 2)
-SIMILAR = 2  # pairs per image that look alike, besides those that overlap: they may close a loop
 # Degrees that rays to a point may be off in each adjustment, to points made anew: the tracking
 # drifts by a degree, which is 5 pixels in a small picture and 25 in a large one. At least
 # `limits.MAX_ERROR_PX`.
@@ -94,16 +95,11 @@ def match_near(job: MappingJob, viewmats: Viewmats, report: Reporter) -> PosesCh
     model = _posed(job, viewmats)
     images = {image.name: image for image in model.images.values() if image.has_pose}
     offset = _widest(model, ROUNDS_DEG[0])
-    with pycolmap.Database.open(job.database) as opened:
-        keypoints = {
-            name: opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
-            for name, image in images.items()}
     matches, agreeing = Counter[str](), Counter[str]()
-    for pair, geometry in matching.read_verified(job.database).items():
+    for pair, ours, theirs in matching.read_matched_pixels(
+            job.database, matching.read_verified(job.database)):
         if pair not in near or not set(pair) <= images.keys():
             continue
-        ours, theirs = (keypoints[name][geometry.inlier_matches[:, side]]
-                        for side, name in enumerate(pair))
         count = int(np.count_nonzero(explained_matches(
             images[pair[0]], ours, images[pair[1]], theirs, 0.0, offset)))
         for name in pair:
@@ -127,7 +123,7 @@ def match_overlapping(
     pairs = overlapping_pairs(model)
     known = pairs | near_pairs(job.names)
     alike = matching.similar_pairs(
-        job.database, job.names, seed=job.seed, nearest=SIMILAR, besides=known)
+        job.database, job.names, seed=job.seed, nearest=LOOP_CANDIDATES, besides=known)
     matching.match_pairs(
         job, known | (alike - overlapping_pairs(model, WIDEST)), report)
 
@@ -147,8 +143,8 @@ def adjust_tracked(
     for number, angle in enumerate(ROUNDS_DEG):
         off = _widest(model, angle)
         if number:
-            bent = bend_model(model, matching.read_verified(job.database), seed=job.seed)
-            model = bent or model
+            closed = optimize_model(model, matching.read_verified(job.database), seed=job.seed)
+            model = closed or model
             _place(model, _follow(model, viewmats))
         make_points(model, cache, job.seed, off)
         if not number:
@@ -166,7 +162,9 @@ def adjust_tracked(
         before)
 
 
-def hold_rest(model: pycolmap.Reconstruction, held: Collection[str], viewmats: Viewmats) -> None:
+def add_prior_poses(
+    model: pycolmap.Reconstruction, held: Collection[str], viewmats: Viewmats
+) -> None:
     """Adds frames to a model, in place, where the tracking has them beside the others."""
     followed = _follow(model, viewmats)
     _place(model, {name: followed[name] for name in held})
@@ -230,7 +228,7 @@ def _place(model: pycolmap.Reconstruction, viewmats: Viewmats) -> None:
 
 def _points(model: pycolmap.Reconstruction) -> dict[str, int]:
     """Returns how many points each camera of a model sees."""
-    images = [model.image(number) for number in model.reg_image_ids()]
+    images = registered_images(model)
     return {image.name: image.num_points3D for image in images}
 
 
@@ -263,8 +261,7 @@ def _carry(
     model: pycolmap.Reconstruction, viewmats: Viewmats, start: str, name: str
 ) -> NDArray[np.float64]:
     """Returns the viewmat of a frame by the tracked motion from another one that has a camera."""
-    known = np.eye(4)
-    known[:3] = model.find_image_with_name(start).cam_from_world().matrix()
+    known = viewmat_of(model.find_image_with_name(start))
     return np.asarray(viewmats[name] @ np.linalg.inv(viewmats[start]) @ known)
 
 

@@ -1,1 +1,1 @@
-"""A long walk in segments: each mapped alone, then joined, and bent so that its loops close."""
+"""A long walk in segments: each mapped alone, then joined, and its loops closed."""

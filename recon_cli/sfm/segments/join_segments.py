@@ -26,10 +26,11 @@ from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.keyframes import choose_keyframes, name_keyframes
 from recon_cli.sfm.features.pair_checks import check_pairs, list_views
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
-from recon_cli.sfm.limits import MAX_TENSION
+from recon_cli.sfm.limits import LOOP_CANDIDATES, MAX_RESIDUAL
 from recon_cli.sfm.mapping import mapper, merge_models, skeleton
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import MatchesResult, SplitResult
-from recon_cli.sfm.segments.loop_closure import Node, bend_segments, move_frames
+from recon_cli.sfm.segments.loop_closure import Node, move_frames, optimize_segments
 from recon_cli.sfm.segments.segment_joins import (
     Join,
     Placement,
@@ -51,16 +52,10 @@ Pair = matching.Pair
 
 REPORT = "segments.json"  # in the stage's folder: the segments, and the evidence of their joins
 MODEL_FOLDER = "parts/1"
-# Frames of other segments that each is matched with because they look alike: enough to find loops,
-# whose frames are matched with more of each other once the segments lie beside each other.
-ALIKE = 2
 # Frames of other segments that each is matched with because it should see the same, those that look
 # alike included. Segments are rigid already: on 1,200 frames, 8 besides those end at an error of
 # .106% of the extent in 1,621 CPU seconds, 4 with them at .112% in 1,422.
 OVERLAPPING_SEGMENTS = 4
-# Adjustments of all with new points in between; segments have settled by themselves before.
-# On 300 frames five take a tenth longer for an error of 3.25 cm in place of 3.29.
-JOIN_ROUNDS = 2
 
 
 def collect_features(job: MappingJob) -> None:
@@ -136,7 +131,7 @@ def match_segments(job: MappingJob, report: Reporter) -> MatchesResult:
     if job.tracks is not None:  # segments have matched what lies near each other
         near, names = near - known, name_keyframes(Tracks.read(job.tracks))
     pairs = near | matching.similar_pairs(
-        job.database, names, seed=job.seed, nearest=ALIKE, besides=known)
+        job.database, names, seed=job.seed, nearest=LOOP_CANDIDATES, besides=known)
     matching.match_pairs(job, pairs, report)
     matching.check_motion(job)
     return matching.count_matches(job)
@@ -189,7 +184,7 @@ def _seed_database(job: MappingJob, index: int) -> None:
         for image in target.read_all_images():
             _copy_features(source, there[image.name], target, image.image_id)
     copy_matches(job.database, segment.database, names)
-    database.seal(segment.database)
+    database.record_rows(segment.database)
 
 
 def read_segments(job: MappingJob) -> list[Segment]:
@@ -204,13 +199,13 @@ def read_segments(job: MappingJob) -> list[Segment]:
 class SegmentGroup:
     """Segments that joins hold together, each frame with its motion to a common frame."""
 
-    motions: Mapping[Node, Similarity]
+    poses: Mapping[Node, Similarity]
     refused: tuple[str, ...]  # joins that were not made, in words
 
     @property
     def indices(self) -> list[int]:
         """The segments, sorted."""
-        return sorted({index for index, _ in self.motions})
+        return sorted({index for index, _ in self.poses})
 
 
 def join_all(
@@ -219,7 +214,7 @@ def join_all(
 ) -> tuple[list[Join], list[SegmentGroup]]:
     """Returns what segments say of each other by their common points, and the groups that follow.
 
-    `walk` are the verified matches of a video, whose segments drift and are bent into each other;
+    `walk` are the verified matches of a video, whose segments drift: a pose graph joins them;
     None for photos, whose segments stay as they are.
     """
     cameras = {segment.index: segment.cameras for segment in segments}
@@ -230,22 +225,22 @@ def join_all(
                        for placement in place_segments(cameras, joins)]
     while True:
         groups, torn = [], set()
-        for placement in place_segments(cameras, joins, bending=True):
-            bent = bend_segments(segments, placement.motions, common, walk, seed=seed)
-            groups.append(SegmentGroup(bent.motions, placement.refused))
-            torn |= {pair for pair, tension in bent.tension.items() if tension > MAX_TENSION}
+        for placement in place_segments(cameras, joins, with_graph=True):
+            optimized = optimize_segments(segments, placement.poses, common, walk, seed=seed)
+            groups.append(SegmentGroup(optimized.poses, placement.refused))
+            torn |= {pair for pair, off in optimized.residuals.items() if off > MAX_RESIDUAL}
         if not torn:
             return joins, groups
         joins = [dataclasses.replace(
             join, motion=None, contradictions=(
-                *join.contradictions, "bending the two cannot bring their common frames together"))
+                *join.contradictions, "no poses of the two bring their common frames together"))
             if (join.first, join.second) in torn else join for join in joins]
 
 
 def _place_rigid(segments: Sequence[Segment], placement: Placement) -> SegmentGroup:
     return SegmentGroup(
-        {(segment.index, name): placement.motions[segment.index] for segment in segments
-         if segment.index in placement.motions for name in segment.cameras.names},
+        {(segment.index, name): placement.poses[segment.index] for segment in segments
+         if segment.index in placement.poses for name in segment.cameras.names},
         placement.refused)
 
 
@@ -268,7 +263,7 @@ def join_models(segments: Sequence[Segment], group: SegmentGroup) -> JoinedModel
     owner = choose_owners(members)
     return JoinedModel(tuple(
         (move_frames(segment.model, {
-            name: group.motions[segment.index, name] for name in segment.cameras.names}),
+            name: group.poses[segment.index, name] for name in segment.cameras.names}),
          frozenset(name for name, which in owner.items() if which is segment))
         for segment in members))
 
@@ -296,7 +291,7 @@ def _join(job: MappingJob, report: Reporter) -> list[JoinedModel]:
     others = _overlapping(source, join_models(segments, groups[0]), known)
     if others - database.pair_names(source.database):
         matching.match_pairs(source, others, report)
-        database.seal(source.database)
+        database.record_rows(source.database)
         joins, groups, _ = _join_by_matches(source, segments)
     report.phase("joining", len(job.segments))
     atomic.write_json(job.out / REPORT, _describe(job, joins, groups))
@@ -330,8 +325,7 @@ def _overlapping(job: MappingJob, joined: JoinedModel, known: Collection[Pair]) 
 
 
 def _images(model: pycolmap.Reconstruction, names: frozenset[str]) -> list[pycolmap.Image]:
-    images = (model.image(number) for number in model.reg_image_ids())
-    return [image for image in images if image.name in names]
+    return [image for image in registered_images(model) if image.name in names]
 
 
 def _posed(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
@@ -362,7 +356,7 @@ def _fit(job: MappingJob, joined: JoinedModel) -> pycolmap.Reconstruction:
     model = mapper.triangulate(job, _posed(job, joined), rounds=1)
     if model.num_reg_images() < len(job.names):
         model = mapper.extend_model(job, model, rounds=0)
-    mapper.refine(job, model, JOIN_ROUNDS)
+    mapper.refine(job, model, skeleton.REST_ROUNDS)
     return model
 
 

@@ -23,7 +23,7 @@ from recon_cli.sfm.limits import (
     MAX_DRIFT,
     MAX_DRIFT_DEG,
     MAX_POINT_ERROR,
-    MAX_TENSION,
+    MAX_RESIDUAL,
     MIN_COMMON_SHARE,
     MIN_LOOP_SHARE,
     MIN_PAIR_INLIERS,
@@ -161,21 +161,21 @@ def _stretches(
 class Placement:
     """Segments that were joined, each with the motion from its frame to a common one."""
 
-    motions: Mapping[int, Similarity]
+    poses: Mapping[int, Similarity]
     refused: tuple[str, ...]  # joins that were not made, in words
 
 
 def place_segments(
-    cameras: Mapping[int, SegmentCameras], joins: Sequence[Join], *, bending: bool = False
+    cameras: Mapping[int, SegmentCameras], joins: Sequence[Join], *, with_graph: bool = False
 ) -> tuple[Placement, ...]:
     """Returns the groups of segments that joins hold together, most cameras first.
 
     Segments with frames in common are joined first. A loop between two of one group counts where it
     is off by no more than a way drifts; then all are adjusted to what all joins say. Where segments
-    are bent into each other next (`bending`), a motion is enough for those with frames in common,
+    get a pose graph next (`with_graph`), a motion is enough for those with frames in common,
     and loops are left to that.
     """
-    order = sorted((join for join in joins if join.holds or (bending and join.touches)),
+    order = sorted((join for join in joins if join.holds or (with_graph and join.touches)),
                    key=lambda join: (not join.frames, -len(join.ours), join.first, join.second))
     group = {index: index for index in cameras}
     tree: list[Join] = []
@@ -191,45 +191,45 @@ def place_segments(
         made = {(join.first, join.second) for join in order}
         inner = [join for join in order if join.first in members]
         near = [join for join in inner if join in tree or _is_near(join, start, cameras)]
-        motions, kept = (start, near) if bending else _close_loops(start, near, tree, cameras)
+        poses, kept = (start, near) if with_graph else _close_loops(start, near, tree, cameras)
         refused = [*(f"the loop of segments {join.first} and {join.second} contradicts the walk"
                      for join in inner if join not in kept), *(
             f"segments {join.first} and {join.second} are not joined: " + "; ".join(
                 join.contradictions or ("fewer than two witnesses support it",))
             for join in joins if (join.first, join.second) not in made and join.frames
             and join.first in members)]
-        placements.append(Placement(motions, tuple(refused)))
+        placements.append(Placement(poses, tuple(refused)))
     return tuple(sorted(placements, key=lambda each: -sum(
-        len(cameras[index].names) for index in each.motions)))
+        len(cameras[index].names) for index in each.poses)))
 
 
 def _chain(members: Collection[int], tree: Sequence[Join]) -> dict[int, Similarity]:
-    """Returns motions to the frame of the first member, along the joins of a tree."""
-    motions = {min(members): Similarity()}
-    while len(motions) < len(members):
+    """Returns poses to the frame of the first member, along the joins of a tree."""
+    poses = {min(members): Similarity()}
+    while len(poses) < len(members):
         for join in tree:
             if join.motion is None:
                 continue
-            if join.second in motions and join.first not in motions:
-                motions[join.first] = motions[join.second].after(join.motion)
-            elif join.first in motions and join.second not in motions:
-                motions[join.second] = motions[join.first].after(join.motion.inverse())
-    return motions
+            if join.second in poses and join.first not in poses:
+                poses[join.first] = poses[join.second].after(join.motion)
+            elif join.first in poses and join.second not in poses:
+                poses[join.second] = poses[join.first].after(join.motion.inverse())
+    return poses
 
 
 def _is_near(
-    join: Join, motions: Mapping[int, Similarity], cameras: Mapping[int, SegmentCameras]
+    join: Join, poses: Mapping[int, Similarity], cameras: Mapping[int, SegmentCameras]
 ) -> bool:
     """Returns whether a join is off by no more than the way between its segments may drift."""
     assert join.motion is not None
-    off = motions[join.second].after(join.motion).after(motions[join.first].inverse())
+    off = poses[join.second].after(join.motion).after(poses[join.first].inverse())
     turn = np.degrees(Rotation.from_matrix(off.rotation).magnitude())
-    between = [index for index in motions
+    between = [index for index in poses
                if min(join.first, join.second) <= index <= max(join.first, join.second)]
-    places = np.concatenate([motions[index].points(cameras[index].centers) for index in between])
+    places = np.concatenate([poses[index].points(cameras[index].centers) for index in between])
     way = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-    ours = motions[join.first].points(join.ours)
-    shift = np.linalg.norm(motions[join.second].points(join.theirs) - ours, axis=1)
+    ours = poses[join.first].points(join.ours)
+    shift = np.linalg.norm(poses[join.second].points(join.theirs) - ours, axis=1)
     return bool(turn <= MAX_DRIFT_DEG and np.median(shift) <= MAX_DRIFT * way)
 
 
@@ -237,37 +237,37 @@ def _close_loops(
     start: Mapping[int, Similarity], joins: Sequence[Join], tree: Sequence[Join],
     cameras: Mapping[int, SegmentCameras],
 ) -> tuple[dict[int, Similarity], list[Join]]:
-    """Returns motions adjusted to joins, and those joins: without loops that tear at others."""
+    """Returns poses adjusted to joins, and those joins: without loops that tear at others."""
     kept = list(joins)
     while True:
-        motions = adjust_motions(start, kept, cameras)
-        tensions = [_tension(join, motions, cameras) for join in kept]
+        poses = adjust_poses(start, kept, cameras)
+        residuals = [_residual(join, poses, cameras) for join in kept]
         loops = [row for row, join in enumerate(kept) if join not in tree]
-        if not loops or max(tensions) <= MAX_TENSION:
-            return motions, kept
-        kept.pop(max(loops, key=lambda row: tensions[row]))
+        if not loops or max(residuals) <= MAX_RESIDUAL:
+            return poses, kept
+        kept.pop(max(loops, key=lambda row: residuals[row]))
 
 
-def _tension(
-    join: Join, motions: Mapping[int, Similarity], cameras: Mapping[int, SegmentCameras]
+def _residual(
+    join: Join, poses: Mapping[int, Similarity], cameras: Mapping[int, SegmentCameras]
 ) -> float:
     """Returns how far the points of a join are apart, in the median, over what they may be."""
-    ours = motions[join.first].points(join.ours)
-    off = np.linalg.norm(motions[join.second].points(join.theirs) - ours, axis=1)
-    return float(np.median(off)) / _unit(join, motions, cameras)
+    ours = poses[join.first].points(join.ours)
+    off = np.linalg.norm(poses[join.second].points(join.theirs) - ours, axis=1)
+    return float(np.median(off)) / _unit(join, poses, cameras)
 
 
 def _unit(
-    join: Join, motions: Mapping[int, Similarity], cameras: Mapping[int, SegmentCameras]
+    join: Join, poses: Mapping[int, Similarity], cameras: Mapping[int, SegmentCameras]
 ) -> float:
     """Returns how far apart equal points of a join may be, in the common frame."""
-    return MAX_POINT_ERROR * motions[join.second].scale * cameras[join.second].depth
+    return MAX_POINT_ERROR * poses[join.second].scale * cameras[join.second].depth
 
 
-def adjust_motions(
+def adjust_poses(
     start: Mapping[int, Similarity], joins: Sequence[Join], cameras: Mapping[int, SegmentCameras]
 ) -> dict[int, Similarity]:
-    """Returns motions at which the points of all joins lie closest together; the first stays."""
+    """Returns poses at which the points of all joins lie closest together; the first stays."""
     order = sorted(start)
     if len(joins) < len(order):  # a chain has nothing to share out
         return dict(start)
@@ -275,7 +275,7 @@ def adjust_motions(
     pairs = [(place[join.first], place[join.second], start[join.first].points(join.ours),
               start[join.second].points(join.theirs), _unit(join, start, cameras))
              for join in joins]
-    # Motions about the middle of each segment, so that their parts are about independent.
+    # Poses about the middle of each segment, so that their parts are about independent.
     middles = np.array([start[index].points(cameras[index].centers).mean(axis=0)
                         for index in order])
 
@@ -287,9 +287,9 @@ def adjust_motions(
             for row, middle in zip(values.reshape(-1, 7), middles[1:], strict=True)]
 
     def residuals(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        motions = moved(values)
+        poses = moved(values)
         return np.concatenate([
-            ((motions[first].points(ours) - motions[second].points(theirs)) / unit).ravel()
+            ((poses[first].points(ours) - poses[second].points(theirs)) / unit).ravel()
             for first, second, ours, theirs, unit in pairs])
 
     sizes = [3 * len(ours) for _, _, ours, _, _ in pairs]

@@ -31,11 +31,12 @@ from recon_cli.jobs.executor import Command, Executor
 from recon_cli.jobs.shared_jobs import JobEnd, SharedJob, run_jobs
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.sfm.features.keyframes import choose_keyframes
-from recon_cli.sfm.job import SPLIT, MappingJob, StepLog
+from recon_cli.sfm.job import SPLIT, MappingJob
 from recon_cli.sfm.mapping.process import CrashError, run_job
 from recon_cli.sfm.results import SplitResult, StepResult
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.layout import disk_errors
+from recon_cli.workspace.steps import StepFolder
 
 Names = tuple[str, ...]
 
@@ -120,7 +121,7 @@ def map_segments(
         job = dataclasses.replace(job, split=count)
         run_job(dataclasses.replace(job, last=SPLIT), progress=progress, record=record,
                 on_idle=lambda: None)
-        split = StepLog(job.out).result(SPLIT, SplitResult)
+        split = StepFolder(job.out).find(SPLIT, SplitResult)
         assert split is not None, "the mapping process ended without a split"
         parts = split.segments
     job = dataclasses.replace(job, segments=parts)
@@ -135,7 +136,7 @@ def map_segments(
                        hint="Try --segments off, more frames, or a slower walk.")
     cpu: dict[str, float] = defaultdict(float)
     for each, step in itertools.product(jobs, jobs[0].steps):
-        result = StepLog(each.out).result(step, StepResult)
+        result = StepFolder(each.out).find(step, StepResult)
         cpu[step] += result.cpu_seconds if result else 0.0
     left = (deadline - time.monotonic()) / 60
     if left <= 0:
@@ -210,7 +211,7 @@ def _run_all(
 
 def _share(job: MappingJob) -> float:
     """Returns how much of a segment is done."""
-    if StepLog(job.out).is_finished(job.last):
+    if StepFolder(job.out).is_finished(job.last):
         return 1.0
     try:
         done, total = read_json(job.out / PROGRESS, list)

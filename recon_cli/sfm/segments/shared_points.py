@@ -20,6 +20,7 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.similarity import Similarity
 from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.limits import MAX_TRIALS, MIN_POSE_INLIERS
+from recon_cli.sfm.model_arrays import ModelArrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,23 +89,13 @@ class AgreedSimilarity:
 
 def describe_segment(index: int, model: pycolmap.Reconstruction) -> Segment:
     """Returns a model as a segment."""
-    images = sorted((model.image(number) for number in model.reg_image_ids()),
-                    key=lambda image: image.name)
-    places = {number: point.xyz for number, point in model.points3D.items()}
-    shown, depths = {}, []
-    for image in images:
-        seen = [(row, point.xy, places[point.point3D_id])
-                for row, point in enumerate(image.points2D) if point.has_point3D()]
-        points = np.array([xyz for _, _, xyz in seen]).reshape(-1, 3)
-        shown[image.name] = ObservedPoints(
-            np.array([row for row, _, _ in seen], np.int64),
-            np.array([xy for _, xy, _ in seen]).reshape(-1, 2), points)
-        depths.append(np.linalg.norm(points - image.projection_center(), axis=1))
-    cameras = SegmentCameras(
-        tuple(image.name for image in images),
-        np.array([image.projection_center() for image in images]).reshape(-1, 3),
-        np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3),
-        float(np.median(np.concatenate([np.zeros(0), *depths]) if depths else [0.0])))
+    arrays = ModelArrays.from_model(model)
+    points = arrays.points[arrays.point]
+    shown = {name: ObservedPoints(arrays.keypoint[own], arrays.xy[own], points[own])
+             for row, name in enumerate(arrays.names) for own in [arrays.observed(row)]}
+    depths = np.linalg.norm(points - arrays.centers[arrays.image], axis=1)
+    cameras = SegmentCameras(arrays.names, arrays.centers, arrays.viewmats[:, :3, :3],
+                             float(np.median(depths if arrays.images else [0.0])))
     return Segment(index, model, cameras, shown)
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.matching import Pair
+from recon_cli.sfm.model_arrays import registered_images
 
 # Pairs that the skeleton shows to overlap, per image, spread over the WIDEST from most to least
 # overlap: the closest tell little about depth. Errors of the cameras of two rooms with 10, 8 and 6
@@ -21,7 +22,7 @@ SAMPLED_POINTS = 150  # points per image
 
 def overlapping_pairs(model: pycolmap.Reconstruction, most: int = OVERLAPPING) -> set[Pair]:
     """Returns each image of a model with `most` ones whose views have something in common."""
-    images = [model.image(number) for number in model.reg_image_ids()]
+    images = registered_images(model)
     return overlapping_images(images, [model] * len(images), most=most)
 
 
@@ -38,11 +39,8 @@ def overlapping_images(
     """
     order = sorted(range(len(images)), key=lambda index: images[index].name)
     images = [images[index] for index in order]
-    places = {key: {number: point.xyz for number, point in model.points3D.items()}
-              for key, model in {id(model): model for model in models}.items()}
     share = _overlap(images, [
-        _sample_points(image, places[id(models[index])])
-        for image, index in zip(images, order, strict=True)])
+        _sample_points(image, models[index]) for image, index in zip(images, order, strict=True)])
     mutual = np.minimum(share, share.T)
     names, pairs = [image.name for image in images], set()
     for row, shares in enumerate(mutual):
@@ -58,11 +56,11 @@ def overlapping_images(
 
 
 def _sample_points(
-    image: pycolmap.Image, places: Mapping[int, NDArray[np.float64]]
+    image: pycolmap.Image, model: pycolmap.Reconstruction
 ) -> NDArray[np.float64]:  # [S, 3]
-    numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
-    step = max(1, len(numbers) // SAMPLED_POINTS)
-    return np.array([places[number] for number in numbers[::step]]).reshape(-1, 3)
+    spots = image.get_observation_points2D()
+    step = max(1, len(spots) // SAMPLED_POINTS)
+    return np.array([model.point3D(spot.point3D_id).xyz for spot in spots[::step]]).reshape(-1, 3)
 
 
 def _overlap(

@@ -20,7 +20,14 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.sphere import is_panorama
 from recon_cli.sfm.limits import MIN_FRAMES
 from recon_cli.sfm.mapping.prior_adjustment import LEAST_ERROR_PX
-from recon_cli.sfm.verdict.scale_drift import POSE, Observations, factorise
+from recon_cli.sfm.verdict.evidence import MatchEvidence
+from recon_cli.sfm.verdict.scale_drift import (
+    MIN_SURE_EXPLAINED,
+    POSE,
+    Observations,
+    factorise,
+)
+from recon_cli.sfm.verdict.weakest_cut import OutlierCamera
 
 # Of the extent: a camera that is known less well is rough, and a model whose cameras are by and
 # large (RMS) known less well cannot be trusted.
@@ -67,6 +74,20 @@ def list_rough(errors: Errors, points: Mapping[str, int]) -> tuple[str, ...]:
     """Returns the cameras that are known badly: by their errors, or as they see too few points."""
     return tuple(sorted(name for name, error in errors.items()
                         if error > MAX_CAMERA_ERROR or points[name] < MIN_CAMERA_POINTS))
+
+
+def list_loose(errors: Errors, evidence: MatchEvidence) -> Iterator[OutlierCamera]:
+    """Yields the cameras that see too few points and do not explain enough of their matches.
+
+    Each point fits so few, whatever is wrong: one with 22 points was off by a tenth of the extent.
+    """
+    for row, name in enumerate(evidence.names):
+        own = (evidence.pairs == row).any(axis=1) & evidence.placed
+        matches = int(evidence.matches[own].sum())
+        share = float(evidence.explained[own].sum()) / max(matches, 1)
+        if (name in errors and share < MIN_SURE_EXPLAINED
+                and evidence.points[row] < MIN_CAMERA_POINTS):
+            yield OutlierCamera(name, share, matches, "", None)
 
 
 def describe_rough(errors: Errors, rough: Sequence[str]) -> Iterator[str]:

@@ -26,6 +26,7 @@ from recon_cli.sfm.features.sphere import (
     unit_rays,
 )
 from recon_cli.sfm.limits import MAX_ERROR_PX, MIN_PAIR_EXPLAINED
+from recon_cli.sfm.model_arrays import ModelArrays
 
 # It is explained by a point seen within this multiple of the model's mean error of it, within these
 # pixels: sharp videos come to .2 and shaken ones to 1. See `tests/bench/bench_verdict.py`.
@@ -82,11 +83,11 @@ def gather_evidence(
 ) -> MatchEvidence:
     """Returns what database and model say about images; ValueError if their names disagree."""
     row = {name: index for index, name in enumerate(names)}
-    images = [model.image(i) for i in model.reg_image_ids()]
-    unknown = sorted(image.name for image in images if image.name not in row)
-    if unknown:
+    arrays = ModelArrays.from_model(model)
+    if unknown := sorted(set(arrays.names) - set(row)):
         raise ValueError(f"the model holds other images: {unknown}")
-    placed = {row[image.name]: image for image in images}
+    rows = np.array([row[name] for name in arrays.names], np.int64)
+    placed = dict(zip(rows.tolist(), arrays.images, strict=True))
     matched = database_file.matched_ids(database)  # before pycolmap opens it
     with pycolmap.Database.open(database) as opened:
         ids = {image.image_id: row[image.name] for image in opened.read_all_images()
@@ -100,19 +101,17 @@ def gather_evidence(
         if first in ids and second in ids:
             tried[ids[first], ids[second]] = tried[ids[second], ids[first]] = True
     centers = np.full((len(names), 3), np.nan)
-    for index, image in placed.items():
-        centers[index] = image.projection_center()
-    rows = {image.image_id: index for index, image in placed.items()}
-    visible = np.zeros((len(names), model.num_points3D()), np.bool_)
+    centers[rows] = arrays.centers
+    visible = np.zeros((len(names), len(arrays.points)), np.bool_)
+    visible[rows[arrays.image], arrays.point] = True
     shown = {index: np.full(len(keypoints[index]), -1) for index in placed}
-    for column, (_, point) in enumerate(sorted(model.points3D.items())):
-        for element in point.track.elements:
-            index = rows[element.image_id]
-            visible[index, column] = True
-            shown[index][element.point2D_idx] = column
+    for at, index in enumerate(placed):
+        own = arrays.observed(at)
+        shown[index][arrays.keypoint[own]] = arrays.point[own]
     traced, joined = _count_joined(shown, pairs, matches)
-    explained = _count_explained(model, placed, keypoints, pairs, matches)
-    positions = np.array([point.xyz for _, point in sorted(model.points3D.items())]).reshape(-1, 3)
+    depths = {index: arrays.depths(at) for at, index in enumerate(placed)}
+    offset = float(np.clip(USUAL_OFFSET * model.compute_mean_reprojection_error(), *OFFSETS))
+    explained = _count_explained(placed, depths, offset, keypoints, pairs, matches)
     return MatchEvidence(
         names=tuple(names), centers=centers, visible=visible, tried=tried,
         registered=np.isin(np.arange(len(names)), list(placed)),
@@ -120,8 +119,10 @@ def gather_evidence(
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
         matches=np.array([len(rows) for rows in matches], np.int64),
         agreeing=_count_agreeing(placed, keypoints, pairs, matches),
-        explained=explained, traced=traced, joined=joined, positions=positions,
-        depths=_usual_depths(len(names), placed, shown, positions),
+        explained=explained, traced=traced, joined=joined, positions=arrays.points,
+        depths=np.array([
+            np.median(depths[index]) if len(depths.get(index, ())) else np.nan
+            for index in range(len(names))]),
         doubled=_find_doubled(shown, pairs, matches, explained))
 
 
@@ -203,22 +204,6 @@ def inverse_depths(
     return np.asarray(-(offset * slope).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-12))
 
 
-def seen_depths(
-    image: pycolmap.Image, places: Mapping[int, NDArray[np.float64]]  # [3] by number of the point
-) -> NDArray[np.float64]:  # [M]
-    """Returns the depths of the points of the model that an image sees, in its camera."""
-    seen = [places[point.point3D_id] for point in image.points2D if point.has_point3D()]
-    return camera_depths(image, np.array(seen).reshape(-1, 3))
-
-
-def camera_depths(
-    image: pycolmap.Image, positions: NDArray[np.float64]  # [M, 3]
-) -> NDArray[np.float64]:  # [M]
-    """Returns the depths of points in a camera, in a panorama their distances from it."""
-    local = np.asarray(image.cam_from_world() * positions)
-    return np.asarray(np.linalg.norm(local, axis=1) if is_panorama(image.camera) else local[:, 2])
-
-
 def nearest_depth(depths: NDArray[np.float64]) -> float:
     """Returns a depth that no point is nearer than, from those of many points; 0 without any."""
     return NEAREST_DEPTH * float(np.percentile(depths, 5)) if len(depths) else 0.0
@@ -256,16 +241,15 @@ def _count_agreeing(
 
 
 def _count_explained(
-    model: pycolmap.Reconstruction,
     placed: Mapping[int, pycolmap.Image],
+    depths: Mapping[int, NDArray[np.float64]],  # of the points that an image shows
+    offset: float,  # pixels
     keypoints: Mapping[int, NDArray[np.float64]],
     pairs: Sequence[tuple[int, int]],
     matches: Sequence[NDArray[np.uint32]],
 ) -> NDArray[np.int64]:
     """Returns how many matches of each pair the poses explain, [P]."""
-    places = {number: point.xyz for number, point in model.points3D.items()}
-    offset = float(np.clip(USUAL_OFFSET * model.compute_mean_reprojection_error(), *OFFSETS))
-    near = {index: nearest_depth(seen_depths(image, places)) for index, image in placed.items()}
+    near = {index: nearest_depth(own) for index, own in depths.items()}
     explained = np.zeros(len(pairs), np.int64)
     for pair, ((first, second), rows) in enumerate(zip(pairs, matches, strict=True)):
         if first in placed and second in placed:
@@ -290,19 +274,6 @@ def _count_joined(
         traced[pair] = np.count_nonzero(both)
         joined[pair] = np.count_nonzero(both & (ours == theirs))
     return traced, joined
-
-
-def _usual_depths(
-    count: int, placed: Mapping[int, pycolmap.Image], shown: Mapping[int, NDArray[np.int64]],
-    positions: NDArray[np.float64],  # [M, 3]
-) -> NDArray[np.float64]:  # [count]
-    """Returns the median depth of the points that each image shows; NaN where it shows none."""
-    depths = np.full(count, np.nan)
-    for index, image in placed.items():
-        seen = shown[index][shown[index] >= 0]
-        if len(seen):
-            depths[index] = np.median(camera_depths(image, positions[seen]))
-    return depths
 
 
 def _find_doubled(

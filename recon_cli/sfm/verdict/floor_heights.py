@@ -16,6 +16,7 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.gravity import find_gravity
 from recon_cli.scene.surfaces import find_floor
 from recon_cli.sfm.features.sphere import is_panorama
+from recon_cli.sfm.model_arrays import ModelArrays
 
 LOOKED_AT = 20  # images that are looked at together, and half of them further on again
 CONE_DEG = 8.0  # between the floor's normal and what is up for all cameras
@@ -37,27 +38,22 @@ def measure_heights(
     NaN where none is seen; ceilings are looked for by level panoramas alone. `order` are names of
     images with a camera as they were taken.
     """
-    images = [model.find_image_with_name(name) for name in order]
-    viewmats = np.array([
-        np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
-    places = {number: point.xyz for number, point in model.points3D.items()}
-    heights = np.full((len(images), 2), np.nan)
-    level = _find_level(viewmats) if all(is_panorama(image.camera) for image in images) else None
-    up = level if level is not None else find_gravity(
-        np.array(list(places.values())).reshape(-1, 3), viewmats).up
+    arrays = ModelArrays.from_model(model, order)
+    count, centers = len(arrays.images), arrays.centers
+    heights = np.full((count, 2), np.nan)
+    level = _find_level(arrays.viewmats) if (
+        all(is_panorama(image.camera) for image in arrays.images)) else None
+    up = level if level is not None else find_gravity(arrays.points, arrays.viewmats).up
     if up is None:
         return heights
-    centers = np.array([image.projection_center() for image in images])
-    shown = [{spot.point3D_id for spot in image.points2D if spot.has_point3D()}
-             for image in images]
     # Each panorama looks all around; a walk shows the floor in a stretch.
-    count, step = (LOOKED_AT, LOOKED_AT // 2) if level is None else (1, 1)
-    for start in range(0, len(images) - (count - step), step):
-        rows = slice(start, start + count)
-        points = np.array([places[number] for number in sorted(set().union(*shown[rows]))])
+    together, step = (LOOKED_AT, LOOKED_AT // 2) if level is None else (1, 1)
+    for start in range(0, count - (together - step), step):
+        rows = slice(start, start + together)
+        shown = (arrays.image >= start) & (arrays.image < start + together)
+        points = arrays.points[np.unique(arrays.point[shown])]
         for side, upward in enumerate((up,) if level is None else (up, -up)):
-            floor = find_floor(
-                points.reshape(-1, 3), centers[rows], upward, cone_deg=CONE_DEG)
+            floor = find_floor(points, centers[rows], upward, cone_deg=CONE_DEG)
             if floor is not None:
                 own = centers[rows] @ floor.up - floor.height
                 known = heights[rows, side]

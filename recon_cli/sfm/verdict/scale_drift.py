@@ -24,6 +24,7 @@ from recon_cli.errors import format_count
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.sphere import is_panorama, radian_px, ray_frames, unit_rays
 from recon_cli.sfm.limits import LOSS_SCALE, MIN_FRAMES
+from recon_cli.sfm.model_arrays import ModelArrays
 from recon_cli.sfm.verdict import view_graph
 from recon_cli.sfm.verdict.evidence import MatchEvidence
 from recon_cli.sfm.verdict.floor_heights import (
@@ -293,35 +294,28 @@ class Observations:
     """O observations of P points by F images, in the images' order, with their derivatives."""
 
     def __init__(self, model: pycolmap.Reconstruction, order: Sequence[str]) -> None:
-        images = [model.find_image_with_name(name) for name in order]
-        self.centers = np.array([image.projection_center() for image in images])  # [F, 3]
-        rotations = np.array([image.cam_from_world().rotation.matrix() for image in images])
-        rows, numbers, places, focals, frames = [], [], [], [], []
-        most = max(len(image.camera.params) for image in images)
-        lenses, by_lens = [], []
-        for row, image in enumerate(images):
-            spots = [spot for spot in image.points2D if spot.has_point3D()]
-            rows.append(np.full(len(spots), row))
-            numbers += [spot.point3D_id for spot in spots]
-            pixels = np.array([spot.xy for spot in spots]).reshape(-1, 2)
-            focals.append(np.full(len(spots), radian_px(image.camera)))
-            lenses.append(np.full(len(spots), image.camera_id))
+        arrays = ModelArrays.from_model(model, order)
+        places, frames, by_lens = [], [], []
+        most = max(len(image.camera.params) for image in arrays.images)
+        for row, image in enumerate(arrays.images):
+            pixels = arrays.xy[arrays.observed(row)]
             if is_panorama(image.camera):  # an error is looked at in the plane across its ray
                 frames.append(ray_frames(unit_rays(image.camera, pixels)))
-                places.append(np.zeros((len(spots), 2)))
-                by_lens.append(np.zeros((len(spots), 2, most)))
+                places.append(np.zeros((len(pixels), 2)))
+                by_lens.append(np.zeros((len(pixels), 2, most)))
                 continue
-            frames.append(np.tile(np.eye(3), (len(spots), 1, 1)))
+            frames.append(np.tile(np.eye(3), (len(pixels), 1, 1)))
             places.append(_undistort(image.camera, pixels))
             by_lens.append(_derive_by_lens(image.camera, pixels, most))
-        known, point = np.unique(np.array(numbers, np.int64), return_inverse=True)
-        points = np.array([model.point3D(int(number)).xyz for number in known]).reshape(-1, 3)
-        self.image, self.point, self.points = np.concatenate(rows), point, len(known)
-        cameras, self.lens = np.unique(np.concatenate(lenses), return_inverse=True)
+        known, self.point = np.unique(arrays.point, return_inverse=True)
+        self.centers, self.image, self.points = arrays.centers, arrays.image, len(known)
+        lenses = np.array([image.camera_id for image in arrays.images])[self.image]
+        cameras, self.lens = np.unique(lenses, return_inverse=True)
         self.lenses, self.by_lens = len(cameras), np.concatenate(by_lens)
-        self._derive(rotations[self.image], points[point] - self.centers[self.image],
-                     np.concatenate(places), np.concatenate(focals)[:, None],
-                     np.concatenate(frames))
+        focals = np.array([radian_px(image.camera) for image in arrays.images])
+        self._derive(arrays.viewmats[self.image, :3, :3],
+                     arrays.points[arrays.point] - self.centers[self.image],
+                     np.concatenate(places), focals[self.image, None], np.concatenate(frames))
 
     def _derive(
         self, rotations: NDArray[np.float64], rays: NDArray[np.float64],

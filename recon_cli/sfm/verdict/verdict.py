@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import SfmError, format_count, list_names
+from recon_cli.errors import SfmError, format_count, list_names, name_command
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.sphere import is_panorama
 from recon_cli.sfm.features.still_points import MAX_STILL, find_still_share
@@ -187,6 +187,14 @@ def examine(
               for name, count in zip(names, evidence.points, strict=True) if count}
     errors = {} if given or times else camera_covariance.estimate_camera_errors(
         model, tuple(points))
+    problems = (*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
+                *_describe_drift(loops, scale), *_describe_still(still),
+                *camera_covariance.describe_inexact(errors),
+                *describe_shifted_centres(model, database),
+                *(lens.sentence() for lens in better if lens.is_wrong))
+    if not problems:  # without them a broken model would look better than it is
+        outliers = tuple(camera_covariance.list_loose(errors, evidence))
+        problems = tuple(_describe_outliers(outliers))
     return ModelVerdict(
         images=len(names), registered=int(np.count_nonzero(rows)),
         model_parts=model_parts, match_parts=match_parts,
@@ -198,11 +206,7 @@ def examine(
             np.count_nonzero(evidence.shared[rows] >= MIN_POSE_INLIERS, axis=1)),
         still=still, scale=scale, open_loops=loops, lenses=better,
         camera_errors=errors, rough=camera_covariance.list_rough(errors, points),
-        problems=(*_describe_problems(model_parts, weakest_cut, aliasing, outliers, jumps),
-                  *_describe_drift(loops, scale), *_describe_still(still),
-                  *camera_covariance.describe_inexact(errors),
-                  *describe_shifted_centres(model, database),
-                  *(lens.sentence() for lens in better if lens.is_wrong)))
+        problems=problems)
 
 
 def _find_drift(
@@ -252,8 +256,8 @@ def check_weak_link(verdict: ModelVerdict, accept: bool, *, given: bool = False)
             "--accept-weak."))
     raise SfmError(
         " ".join(problems),
-        hint="Use more frames between the two parts (`recon ingest --frames N`), match all of them "
-        "(--pairs exhaustive), or keep the model as it is with --accept-weak.")
+        hint=f"Use more frames between the two parts ({name_command('ingest --frames N')}), match "
+        "all of them (--pairs exhaustive), or keep the model as it is with --accept-weak.")
 
 
 def _parts(names: Sequence[str], weights: view_graph.Weights) -> tuple[Names, ...]:
@@ -269,13 +273,17 @@ def _describe_problems(
         sizes = ", ".join(str(len(part)) for part in parts)
         problems.append(f"The model has {len(parts)} parts, which share no point; cameras in each: "
                         f"{sizes}.")
-    if outliers:
-        problems.append("These cameras contradict the matches of their images: "
-                        f"{list_names([camera.name for camera in outliers])}.")
+    problems += _describe_outliers(outliers)
     return problems + [
         f"The camera jumps from {jump.before} to {jump.after}: {jump.ratio:.0f} times as far as "
         f"usual, but at most {MAX_LEAP:.0f} times is possible."
         for jump in jumps if jump.ratio > MAX_LEAP]
+
+
+def _describe_outliers(outliers: Sequence[OutlierCamera]) -> list[str]:
+    return [] if not outliers else [
+        "These cameras contradict the matches of their images: "
+        f"{list_names([camera.name for camera in outliers])}."]
 
 
 def _describe_drift(loops: Sequence[OpenLoop], cut: ScaleCut | None) -> list[str]:

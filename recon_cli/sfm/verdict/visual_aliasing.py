@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.faces import panorama_pixels
 from recon_cli.sfm.features.sphere import is_panorama
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.verdict import view_graph
 from recon_cli.sfm.verdict.evidence import MatchEvidence
 from recon_cli.workspace.json_record import JsonRecord
@@ -87,8 +88,8 @@ def measure_overlap(model: pycolmap.Reconstruction, evidence: MatchEvidence) -> 
     """Returns where images of a model should show the same; pairs never matched are zero."""
     count = len(evidence.names)
     row = {name: index for index, name in enumerate(evidence.names)}
-    images = {row[model.image(i).name]: model.image(i) for i in model.reg_image_ids()}
-    positions = np.array([point.xyz for _, point in sorted(model.points3D.items())]).reshape(-1, 3)
+    images = {row[image.name]: image for image in registered_images(model)}
+    positions = evidence.positions
     samples = _sample(evidence, positions, images)
     everything = np.arange(len(samples.image))
     cells = _cells(samples, everything, count)

@@ -10,7 +10,7 @@ import dataclasses
 import filecmp
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial, reduce
 from pathlib import Path
@@ -19,14 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import format_count
-from recon_cli.io.colmap import Pinhole
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
 from recon_cli.io.training_scene import held_out_names
 from recon_cli.room.scale import ScaleBetween
+from recon_cli.scene.camera import Lens
 from recon_cli.scene.faces import is_cube_face, view_name
+from recon_cli.sfm.features.sphere import is_panorama
 from recon_cli.sfm.job import PLACED, VERDICT, PlaceJob, Reporter, fresh_folder
 from recon_cli.sfm.mapping.mapper import triangulation_angles
+from recon_cli.sfm.model_arrays import registered_images, viewmat_of
 from recon_cli.sfm.poses.align_world import refuse_contradiction, world_transform
 from recon_cli.sfm.poses.depth_points import add_depth_points
 from recon_cli.sfm.poses.scale_evidence import ask_device
@@ -79,9 +81,8 @@ def place_model(
     are arbitrary. ConfigError if a place of --scale-between is unknown; SfmError if what tells the
     scale contradicts itself, unless that is accepted.
     """
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    viewmats = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-                for name, image in images.items()}
+    images = {image.name: image for image in registered_images(model)}
+    viewmats = {name: viewmat_of(image) for name, image in images.items()}
     device = ask_device(job, model, viewmats)
     if device.depth_scale is not None and job.pose_use != "keep" and job.poses is not None:
         ingest = job.poses.parent
@@ -90,7 +91,8 @@ def place_model(
     several = {number for number, camera in model.cameras.items() if has_faces(camera)}
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,
-        gravity=job.gravity and device.axes_open, given_up=device.up,
+        level_views=_level_views(images.values(), viewmats) if (
+            job.gravity and device.axes_open) else None, given_up=device.up,
         scale_between=ScaleBetween(*job.scale_between) if job.scale_between else None,
         metric=device.metric, sources=device.sources,
         pinholes={name: _pinhole(image.camera) for name, image in images.items()
@@ -108,16 +110,28 @@ def place_model(
     return summary
 
 
-def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+def _level_views(
+    images: Iterable[pycolmap.Image], viewmats: Mapping[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:  # [C, 4, 4]
+    """Returns the views whose x axes are held level: those of cameras, and two of each panorama.
+
+    A tripod, or the camera itself, levels a panorama all around: also a quarter turn further on.
+    """
+    aside = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    return np.array([*viewmats.values(), *(
+        aside @ viewmats[image.name] for image in images if is_panorama(image.camera))])
+
+
+def _pinhole(camera: pycolmap.Camera) -> Lens:
     """Returns the camera of the undistorted image, to whose pixels --scale-between may point."""
     flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    return Pinhole(flat.width, flat.height, *flat.params)
+    return Lens("PINHOLE", flat.width, flat.height, tuple(flat.params))
 
 
 def undistort(job: PlaceJob, report: Reporter) -> tuple[Mapping[str, float], ...]:
     """Writes out/undistorted/{images,denoised,sparse} and masks/, and returns its cameras."""
     model = pycolmap.Reconstruction(job.out / SPARSE)
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    images = {image.name: image for image in registered_images(model)}
     names = sorted(images)
     report.phase("undistorted", len(names))
     work = fresh_folder(job.out / "undistorted")
@@ -149,7 +163,7 @@ def undistort(job: PlaceJob, report: Reporter) -> tuple[Mapping[str, float], ...
     with ThreadPoolExecutor(job.threads) as pool:
         for count, _ in enumerate(pool.map(write, names), 1):
             report.done(count)
-    counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
+    counts = Counter(image.camera_id for image in registered_images(flat))
     return tuple(
         {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length(),
          "frames": counts[index]}

@@ -23,6 +23,7 @@ from recon_cli.io.images import read_png, write_png
 from recon_cli.scene.faces import nearest_face, view_name
 from recon_cli.sfm.features.sphere import unit_rays
 from recon_cli.sfm.job import PlaceJob, Reporter
+from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.views.flat_views import FlatView
 
 
@@ -34,7 +35,7 @@ def write_views(
     """Writes the views of a model into `work` and returns their cameras, as `PlacedPart`."""
     images, twins, masks, sparse = folders
     number_cameras(views)
-    frames = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    frames = {image.name: image for image in registered_images(model)}
     for folder in (images, twins, sparse):
         (work / folder).mkdir()
 
@@ -74,7 +75,7 @@ def write_views(
     write_face_frames(work, {
         name_view(name, view): name for name in names for view in views[frames[name].camera_id]
         if view.face is not None})
-    counts = Counter(flat.image(i).camera_id for i in flat.reg_image_ids())
+    counts = Counter(image.camera_id for image in registered_images(flat))
     return [{"width": camera.width, "height": camera.height,
              "focal_px": camera.mean_focal_length(), "frames": counts[number]}
             for number, camera in sorted(flat.cameras.items())]
@@ -140,7 +141,7 @@ def _share_out(
     image: pycolmap.Image, views: Sequence[FlatView]
 ) -> Iterator[tuple[list[int], NDArray[np.float64]]]:
     """Yields the ids of the points that each view sees, and their pixels [K, 2]."""
-    spots = [spot for spot in image.points2D if spot.has_point3D()]
+    spots = image.get_observation_points2D()
     points = [spot.point3D_id for spot in spots]
     rays = unit_rays(image.camera, np.array([spot.xy for spot in spots]).reshape(-1, 2))
     nearest = nearest_face(rays, [view.rotation for view in views])

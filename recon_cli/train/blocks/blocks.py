@@ -24,7 +24,7 @@ from safetensors.numpy import save_file
 from recon_cli import machine
 from recon_cli.config.stages import ComputeConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, FormatError, ManifestError, ReconstructionError
+from recon_cli.errors import ConfigError, FormatError, Hint, ManifestError, ReconstructionError
 from recon_cli.io.colmap import read_observations, write_part
 from recon_cli.io.training_scene import load_scene
 from recon_cli.jobs.executor import CORES, NEEDS_GPU, Command, Executor, start_executor
@@ -42,9 +42,9 @@ from recon_cli.train.masks import with_masks
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import digest_outputs, sha256_json
-from recon_cli.workspace.journal import JOBS
 from recon_cli.workspace.layout import Workspace, disk_errors
 from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord, find_changed_outputs
+from recon_cli.workspace.steps import JOBS
 
 MOST_VIEWS = 1200  # of one model; the most that was ever trained as one
 LEAST_VIEWS = 20  # of a block, so that each view of it has neighbours
@@ -150,7 +150,7 @@ class BlockJob:
         except (AttributeError, KeyError, TypeError, ValueError, OSError, RecursionError,
                 SafetensorError) as error:
             raise FormatError(
-                f"{file} does not describe a block.", hint="Run `recon train` again.") from error
+                f"{file} does not describe a block.", hint=Hint("train", then=" again")) from error
 
     def load_scene(self) -> Scene:
         """Writes the block's part of the sparse model beside the job, and returns its scene."""

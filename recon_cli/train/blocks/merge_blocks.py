@@ -19,7 +19,7 @@ import torch
 
 from recon_cli.config.stages import MIN_GAUSSIANS, RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import FormatError, ReconstructionError
+from recon_cli.errors import FormatError, ReconstructionError, name_command
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.evaluation.reference_views import load_reference_views, render_view
 from recon_cli.io.images import fit_camera
@@ -30,7 +30,7 @@ from recon_cli.scene.splats import Splats, joined
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.train.blocks.blocks import MERGE_SHARE, BlockJob, record
 from recon_cli.train.fit.initialize import begin_state, restore_state
-from recon_cli.train.fit.runner import CHECKPOINT, LOG, Segment, run_fit
+from recon_cli.train.fit.runner import CHECKPOINT, LOG, RunSegment, run_fit
 from recon_cli.train.fit.schedule import make_schedule
 from recon_cli.train.fit.state import TrainState
 from recon_cli.train.fit.train_data import gaussians_that_fit, load_task, read_config, write_config
@@ -89,7 +89,7 @@ def merge_blocks(
     if not len(splats):
         raise ReconstructionError(
             "No block has a Gaussian in its cell.",
-            hint="Train one model by `recon train --blocks off`.")
+            hint=f"Train one model by {name_command('train --blocks off')}.")
     before = sum(block.summary.iterations for block in blocks)
     steps = round(_FINETUNE * before)
     config = dataclasses.replace(
@@ -180,7 +180,7 @@ def _finetune(
     def record_all(done: int, total: int) -> None:
         record(ctx, 1 - MERGE_SHARE * (1 - done / total))
 
-    run_fit(state, task, steps, Segment(out, "merge", steps),
+    run_fit(state, task, steps, RunSegment(out, "merge", steps),
             dataclasses.replace(ctx, record=record_all))
     return state
 

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from recon_cli.errors import TrainingError, format_count
+from recon_cli.errors import TrainingError, format_count, name_command
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
 from recon_cli.train.fit.state import TrainState, load_state, new_state
@@ -44,7 +44,7 @@ def splats_from_points(
         raise TrainingError(
             f"The reconstruction has {format_count(len(points), 'point')}; at least 4 are needed "
             "to start.",
-            hint="Film slower with more overlap, then run `recon ingest` again.")
+            hint=f"Film slower with more overlap, then run {name_command('ingest')} again.")
     if len(points) > most:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[:most])
         points, colors = points[chosen], colors[chosen]

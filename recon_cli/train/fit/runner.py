@@ -19,7 +19,7 @@ from recon_cli.train.fit.importance import Importance
 from recon_cli.train.fit.loop import fit
 from recon_cli.train.fit.state import LONG_SAVE, SAVE_SHARE, TrainState, save_state
 from recon_cli.train.fit.task import Task
-from recon_cli.workspace import journal
+from recon_cli.workspace import steps
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.summaries import LogRow
 
@@ -28,7 +28,7 @@ CHECKPOINT = "checkpoint.safetensors"
 
 
 @dataclass(frozen=True)
-class Segment:
+class RunSegment:
     """The steps of a run that one stage takes, and the files that they leave."""
 
     out: Path  # partial folder of the stage
@@ -42,7 +42,7 @@ class Segment:
 
 
 def run_fit(
-    state: TrainState, task: Task, until: int, segment: Segment, ctx: StageContext,
+    state: TrainState, task: Task, until: int, segment: RunSegment, ctx: StageContext,
     importance: Importance | None = None,
 ) -> None:
     """Fits until `until` steps, saving the state as it goes.
@@ -113,7 +113,7 @@ class TrainLog(TrainCallback):
 
     def keep(self) -> None:
         """Records the log up to here, for a later run that continues from here."""
-        journal.expect_growth(self._path)
+        steps.expect_growth(self._path)
 
     def _write(self, row: LogRow) -> None:
         row = dataclasses.replace(

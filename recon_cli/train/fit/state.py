@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.errors import FormatError, TrainingError
+from recon_cli.errors import FormatError, TrainingError, name_command
 from recon_cli.render import Statistics
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import Splats
@@ -202,7 +202,7 @@ def read_progress(path: Path) -> tuple[int, int]:
 def _unreadable(path: Path, error: Exception) -> FormatError:
     return FormatError(
         f"The checkpoint {path} cannot be read: {error}.",
-        hint=f"Run `recon {path.parent.name} --again`; it starts from the beginning.")
+        hint=f"Run {name_command(f'{path.parent.name} --again')}; it starts from the beginning.")
 
 
 def check_finite(tensors: dict[str, Tensor], where: str) -> None:

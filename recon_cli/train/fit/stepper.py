@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon_cli.errors import TrainingError
+from recon_cli.errors import TrainingError, name_command
 from recon_cli.render import Statistics
 from recon_cli.render.contract import StepOptions
 from recon_cli.render.response import ResponseGradient
@@ -268,4 +268,5 @@ def skip(state: TrainState, task: Task, steps: int = 1) -> None:
         raise TrainingError(
             f"The loss is not finite at step {state.iteration}, as at {state.skipped - 1} steps "
             f"before it; at most {most} are allowed.",
-            hint="Lower the learning rates, or run `recon train --again` with another --seed.")
+            hint=f"Lower the learning rates, or run {name_command('train --again')} with another "
+            "--seed.")

@@ -14,7 +14,14 @@ import torch
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import ConfigError, FormatError, TrainingError, format_count
+from recon_cli.errors import (
+    ConfigError,
+    FormatError,
+    Hint,
+    TrainingError,
+    format_count,
+    name_command,
+)
 from recon_cli.io import views as view_files
 from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
@@ -89,8 +96,8 @@ def _refuse_tiny_units(scene: Scene) -> None:
         raise TrainingError(
             f"Half of the points are nearer than {scene.nearness:.2g} units to a camera, but "
             f"Gaussians nearer than {NEAR:g} are not drawn: the units of this scene are too large.",
-            hint="Give it a scale with `recon sfm --scale-between A B METRES`, or scale the poses "
-            "of the data set.")
+            hint=f"Give it a scale with {name_command('sfm --scale-between A B METRES')}, or "
+            "scale the poses of the data set.")
 
 
 def load_views(
@@ -121,14 +128,14 @@ def read_config(folder: Path) -> RunConfig:
         FormatError: a version before this one wrote a value that this one does not know.
     """
     path = folder / "config.json"
-    values = RunConfig.rename(read_json(path, dict, hint="Run `recon train --again`."))
+    values = RunConfig.rename(read_json(path, dict, hint=Hint("train", again=True)))
     names = {item.name for item in dataclasses.fields(RunConfig)}
     try:
         return RunConfig(**{name: value for name, value in values.items() if name in names})
     except (ConfigError, AttributeError) as error:
         raise FormatError(
             f"{path} is of another version of recon: {error}",
-            hint="Run `recon train --again`.") from error
+            hint=Hint("train", again=True)) from error
 
 
 @dataclass(frozen=True)
@@ -224,7 +231,7 @@ def refuse_few_views(scene: Scene) -> None:
         raise TrainingError(
             f"Only {format_count(len(scene.train), 'view')} can be trained on; at least 2 are "
             "needed.",
-            hint="Run `recon ingest` with a smaller --holdout, such as every:8.")
+            hint=Hint("ingest", then=" with a smaller --holdout, such as every:8"))
 
 
 def _memory(

@@ -25,7 +25,6 @@ from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit.task import Evidence
 from recon_cli.train.parts.decisions import Rule
 from recon_cli.train.parts.part import Part, Sign, Start, TrialScene
-from recon_cli.train.parts.sparse_points import project_points
 
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart
@@ -86,7 +85,7 @@ def find_background(
     searched = [_search_view(view, points) for view in views[::max(1, -(-len(views) // _VIEWS))]]
     for shown in searched:
         small = shown.view
-        rows, column, line = project_points(small.camera, sphere)
+        rows, column, line, _ = small.camera.find_visible(sphere)
         looked_at[rows] += 1
         free = shown.free[line, column]
         empty[rows[free]] += 1
@@ -116,7 +115,7 @@ def _search_view(view: TrainView, points: NDArray[np.float64]) -> _SearchView:
     free = ~_cover_mask(small, points)
     if small.mask is not None:
         free &= small.mask
-    rows, column, line = project_points(small.camera, points)
+    rows, column, line, _ = small.camera.find_visible(points)
     depths = _depths(small.camera, points[rows])
     nearest = np.argsort(depths, kind="stable")
     _, first = np.unique((line * small.camera.width + column)[nearest], return_index=True)
@@ -164,9 +163,7 @@ def _place_gaps(
     line, column = line[free], column[free]
     _, near = cKDTree(shown.pixels).query(np.stack([column, line], 1), k=_NEIGHBOURS)
     depths = np.median(shown.depths[near], axis=1)
-    rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (line + 0.5 - camera.cy) / camera.fy,
-                     np.ones(len(line))], 1)
-    places = (rays * depths[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    places = camera.unproject(np.stack([column, line], 1) + 0.5, depths)
     return places, shown.view.image[line, column].astype(np.float64), depths
 
 
@@ -176,7 +173,7 @@ def _seen_through(
     """Tells of which places [G, 3] too many views show points beyond."""
     looked_at, through = np.zeros(len(places)), np.zeros(len(places))
     for shown in searched:
-        rows, column, line = project_points(shown.view.camera, places)
+        rows, column, line, _ = shown.view.camera.find_visible(places)
         distance, near = cKDTree(shown.pixels).query(np.stack([column, line], 1))
         beyond = shown.depths[near] > _THROUGH * _depths(shown.view.camera, places[rows])
         looked_at[rows] += 1
@@ -187,7 +184,7 @@ def _seen_through(
 def faces(view: TrainView, content: Background, points: NDArray[np.float64]) -> bool:
     """Tells whether a view sees places far outside, past the points [P, 3]."""
     small = reduce_to(view, _SEARCH_SIDE)
-    _, column, line = project_points(small.camera, content.positions)
+    _, column, line, _ = small.camera.find_visible(content.positions)
     return int((~_cover_mask(small, points)[line, column]).sum()) >= _FACING
 
 
@@ -218,7 +215,7 @@ def _cover_mask(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.bool
     camera, edge = view.camera, _COVER_RANGE[1]
     wider = replace(camera, width=camera.width + 2 * edge, height=camera.height + 2 * edge,
                     cx=camera.cx + edge, cy=camera.cy + edge)
-    _, column, line = project_points(wider, points)
+    _, column, line, _ = wider.find_visible(points)
     hit = np.zeros((wider.height, wider.width), np.uint8)
     hit[line, column] = 1
     pixels = np.argwhere(hit)

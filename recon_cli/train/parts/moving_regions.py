@@ -120,11 +120,9 @@ def _project(
     camera: Camera, where: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Returns column and line, from the centre of the first pixel, and depth of places [N, 3]."""
-    x, y, z = camera.viewmat[:3, :3] @ where.T + camera.viewmat[:3, 3:]
-    safe = np.where(z > 0, z, np.inf)
-    return (np.asarray(camera.fx * x / safe + camera.cx - 0.5, np.float32),
-            np.asarray(camera.fy * y / safe + camera.cy - 0.5, np.float32),
-            np.asarray(z, np.float32))
+    pixels, depths = camera.project(where)
+    column, line = (np.nan_to_num(pixels, nan=-1) - 0.5).astype(np.float32).T
+    return column, line, depths.astype(np.float32)
 
 
 def sees(view: ComparedView, where: NDArray[np.float64]) -> NDArray[np.bool_]:

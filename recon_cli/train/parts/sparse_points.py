@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.scene.camera import Camera
 from recon_cli.scene.train_view import TrainView
 
 _SIDE = 100  # pixels of the longer side; a small view is denoised and does not mind blur
@@ -76,18 +75,6 @@ def estimate_gains(
                         float(apart / max(2 * variance, 1e-12)), len(pairs))
 
 
-def project_points(
-    camera: Camera, points: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Returns the rows of the points inside the image, and the columns and lines they fall on."""
-    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
-    ahead = np.maximum(z, 1e-9)
-    u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
-    rows = np.flatnonzero(
-        (z > 1e-9) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height))
-    return rows, u[rows].astype(np.int64), v[rows].astype(np.int64)
-
-
 def choose_points(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
     """Returns the points [P, 3], of more than 4,000 a seeded draw."""
     if len(points) <= _POINTS:
@@ -98,7 +85,7 @@ def choose_points(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.floa
 def log_colors(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64]:  # [P, 3]
     """Returns the logarithm of each point's colour; NaN where it is not seen or may be clipped."""
     image, block = _reduce(view)
-    rows, column, line = project_points(view.camera, points)
+    rows, column, line, _ = view.camera.find_visible(points)
     column, line = column // block, line // block
     inside = (line < image.shape[0]) & (column < image.shape[1])
     colors = np.full((len(points), 3), np.nan)

@@ -66,7 +66,7 @@ def examine(scene: TrialScene) -> Needs:
     return Needs(config, tuple(trials.decisions), trials.masks)
 
 
-class _Pace(TrainCallback):
+class _PaceCallback(TrainCallback):
     """Cuts a short run that would not end in time."""
 
     def __init__(self, check: Callable[[int], None]) -> None:
@@ -229,7 +229,7 @@ class Trials:
                         validation=[], schedule=Schedule(config, recipe), cell=None)
         state = first_state(small, self.scene.points, self.scene.colors, most=_POINTS)
         pace = self.deadline.keep_pace(config.iterations * max(1, self._runs))
-        fit(state, small, config.iterations, (_Pace(pace),) if limited else ())
+        fit(state, small, config.iterations, (_PaceCallback(pace),) if limited else ())
         self.longest = max(self.longest, self.deadline.spent - begun)
         self._runs -= 1
         return state

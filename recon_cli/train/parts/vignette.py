@@ -29,7 +29,7 @@ from recon_cli.train.fit.task import Evidence, Task
 from recon_cli.train.parts.decisions import Rule
 from recon_cli.train.parts.part import Part, Sign, TrialScene
 from recon_cli.train.parts.photometry import FittedPart
-from recon_cli.train.parts.sparse_points import choose_points, log_colors, project_points
+from recon_cli.train.parts.sparse_points import choose_points, log_colors
 from recon_cli.workspace.summaries import PhotometrySummary, VignetteSummary
 
 _RATE, _FALL = 0.002, 0.1  # of the exponents; it falls to a tenth, as that of exposures does
@@ -89,7 +89,7 @@ def _corner_loss(exponents: NDArray[np.float64]) -> float:
 def _squares(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the squared distance of each point's pixel as in `response.squared_distances`."""
     camera, squares = view.camera, np.zeros(len(points))
-    rows, column, line = project_points(camera, points)
+    rows, column, line, _ = camera.find_visible(points)
     corner = (max(camera.cx, camera.width - camera.cx) ** 2
               + max(camera.cy, camera.height - camera.cy) ** 2)
     squares[rows] = ((column + 0.5 - camera.cx) ** 2 + (line + 0.5 - camera.cy) ** 2) / corner

@@ -25,7 +25,7 @@ from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit.importance import Importance
 from recon_cli.train.fit.initialize import make_finished_state, restore_state
 from recon_cli.train.fit.loop import validation_psnr
-from recon_cli.train.fit.runner import LOG, Segment, TrainLog, run_fit, seconds_at
+from recon_cli.train.fit.runner import LOG, RunSegment, TrainLog, run_fit, seconds_at
 from recon_cli.train.fit.schedule import RecoverySchedule
 from recon_cli.train.fit.state import TrainState, save_state
 from recon_cli.train.fit.task import Task
@@ -156,7 +156,7 @@ class StoredPruneRun(PruneRun):
         begin, cpu_begin = time.perf_counter(), time.process_time()
         if self.state.iteration < until:
             number = len(self.done)
-            run_fit(self.state, self.task, until, Segment(
+            run_fit(self.state, self.task, until, RunSegment(
                 self._out, f"round {number}", first=self.first, until=max(self.until, until),
                 earlier_seconds=self.source.earlier_seconds, checkpoint=_name(number)),
                 self._ctx, importance)

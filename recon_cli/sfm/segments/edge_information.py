@@ -1,4 +1,4 @@
-"""How well each frame of a walk is tied to the next: where a model may have drifted.
+"""What a model knows of each frame of a walk against the next: where it may have drifted.
 
 Scale passes from one stretch of a walk to the next by points that both have triangulated by
 themselves. Where a camera turns on the spot or in a narrow place there are few, or their rays
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.sfm.model_arrays import ModelArrays
 
 # Frames; whatever shows a point again after more than so many has come back to it.
 RUN = 20
@@ -26,7 +27,7 @@ TURN_PIXELS = 3.0  # by which the place of a point is off from one frame to the 
 
 
 @dataclass(frozen=True, eq=False)
-class Stiffness:
+class EdgeInformation:
     """Standard deviations of what each of F frames in a row has against the next, [F - 1]."""
 
     scale: NDArray[np.float64]  # of the logarithm of their relative scale
@@ -48,10 +49,10 @@ class _Observations:
     returns: NDArray[np.bool_]  # [O], whether it is the first after a gap of more than RUN frames
 
 
-def measure_stiffness(model: pycolmap.Reconstruction, names: Sequence[str]) -> Stiffness:
-    """Returns how stiff a model is between its frames, whose names are given in order."""
-    images = [model.find_image_with_name(name) for name in names]
-    seen = _observe(model, images)
+def measure_information(model: pycolmap.Reconstruction, names: Sequence[str]) -> EdgeInformation:
+    """Returns what a model knows of its frames, whose names are given in order."""
+    arrays = ModelArrays.from_model(model, names)
+    images, seen = arrays.images, _observe(arrays)
     error = max(model.compute_mean_reprojection_error(), LEAST_ERROR)
     noise = error / images[0].camera.mean_focal_length()
     run = np.cumsum(seen.starts) - 1
@@ -68,29 +69,20 @@ def measure_stiffness(model: pycolmap.Reconstruction, names: Sequence[str]) -> S
     turn = np.clip(INFLATION * TURN_PIXELS * noise / np.sqrt(count), *TURNS)
     usual = _usual_depths(seen, len(images))
     loops = np.flatnonzero(seen.returns)
-    return Stiffness(
+    return EdgeInformation(
         np.clip(INFLATION / np.sqrt(scale), *SCALES), turn,
         turn * np.minimum(usual[1:], usual[:-1]),
         np.column_stack([seen.frame[loops - 1], seen.frame[loops]]), seen.point[loops])
 
 
-def _observe(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> _Observations:
-    numbers = np.array(sorted(model.points3D), np.int64)
-    places = np.array([model.point3D(number).xyz for number in numbers.tolist()]).reshape(-1, 3)
-    centers = np.array([image.projection_center() for image in images])
-    seen = [np.unique(np.array(
-        [point.point3D_id for point in image.points2D if point.has_point3D()], np.int64))
-        for image in images]
-    frame = np.repeat(np.arange(len(images)), [len(each) for each in seen])
-    point = np.searchsorted(numbers, np.concatenate([np.zeros(0, np.int64), *seen]))
-    order = np.lexsort((frame, point))
-    frame, point = frame[order], point[order]
-    rays = centers[frame] - places[point]
+def _observe(arrays: ModelArrays) -> _Observations:
+    point, frame = np.unique(np.column_stack([arrays.point, arrays.image]), axis=0).T
+    rays = arrays.centers[frame] - arrays.points[point]
     depth = np.linalg.norm(rays, axis=1)
     new = np.append(True, point[1:] != point[:-1])[:len(point)]
     returns = ~new & (np.diff(frame, prepend=0) > RUN)
     return _Observations(
-        frame, places[point], rays / depth[:, None], depth, new | returns, returns)
+        frame, arrays.points[point], rays / depth[:, None], depth, new | returns, returns)
 
 
 def _opening(
