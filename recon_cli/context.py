@@ -6,18 +6,15 @@ import logging
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from recon_cli.deadline import Deadline
 from recon_cli.progress import NullProgress, Progress
-from recon_cli.workspace.json_record import JsonRecord
 
 if TYPE_CHECKING:
     from recon_cli.config.stages import ComputeConfig
     from recon_cli.scene.camera import Camera
     from recon_cli.scene.splats import Splats
-
-R = TypeVar("R", bound=JsonRecord)
 
 
 @dataclass(frozen=True)
@@ -91,10 +88,6 @@ class StageInputs:
     summaries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     earlier: EarlierResult | None = None  # whose edits the stage reads, if any
     part: str = ""  # of the stage that is made; empty for its own result
-
-    def read_summary(self, stage: str, kind: type[R]) -> R:
-        """Returns what a stage says about its result; ManifestError for another version's."""
-        return kind.from_json(self.summaries[stage])
 
 
 @dataclass(frozen=True)

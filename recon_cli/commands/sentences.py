@@ -63,10 +63,7 @@ def _(denoise: DenoiseSummary) -> str:
 @describe.register
 def _(sfm: SfmSummary) -> str:
     mapped = sum(len(part.names) for part in sfm.parts)
-    return _join([
-        f"{mapped:,} of {sfm.frames:,} frames mapped",
-        f"{len(sfm.parts)} parts" if len(sfm.parts) > 1 else "",
-        f"{len(sfm.left_out):,} left out" if sfm.left_out else ""])
+    return f"{mapped:,} of {sfm.frames:,} frames mapped"
 
 
 @describe.register

@@ -93,7 +93,8 @@ def run_stage(
         tuple(Path(source.path) for source in sources),
         workspace.folder(row.name) if key.continues else None,
         {name: digest for name, digest in key.upstream.items() if digest},
-        checks.summaries(row), _find_earlier(workspace, row), row.part)
+        {name: made.run.summary for name in (*row.needs, *row.uses)
+         if (made := checks.check(name).manifest)}, _find_earlier(workspace, row), row.part)
     logger.debug("%s: running with %s", row.name, config)
     out, earlier = workspace.begin(key, own_digests=row.own_digests)
     from recon_cli.workspace.records import name_photos  # imports numpy

@@ -10,12 +10,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from recon_cli.config import settings as layers
 from recon_cli.config.fields import StageConfig
@@ -184,19 +182,11 @@ class WorkspaceCheck:
                     check.manifest.digest_of(row.reads[name]))
         return digests
 
-    def summaries(self, row: Stage) -> dict[str, Mapping[str, Any]]:
-        """Returns what the stages that a stage reads say about their results."""
-        checks = {name: self.check(name) for name in (*row.needs, *row.uses)}
-        return {name: check.manifest.run.summary for name, check in checks.items()
-                if check.manifest}
-
-    def siblings(self, row: Stage) -> Iterator[StageCheck]:
-        """Yields the checks of the stages that have their options in one class, as `place` and sfm.
-        """
-        for other in [row] if row.part else list(self._rows.values()):
-            if (other.config is row.config and not other.part) or other is row:
-                with suppress(ManifestError):
-                    yield self.check(other.name)
+    def siblings(self, row: Stage) -> list[StageCheck]:
+        """Returns the checks of the other stages that the verb of a stage makes, as `place`."""
+        return [self.check(other.name) for other in self._rows.values()
+                if other.verb == row.verb and other.name != row.name
+                and not (row.part or other.part)]
 
     def _compare(
         self, row: Stage, manifest: Manifest | None, config: StageConfig,

@@ -1,7 +1,7 @@
 """Decides which stages run, and says how each of them stands.
 
 A target that is fresh is left alone. What it needs is run first where the table allows that
-(denoise, sfm); otherwise (ingest, train) an error names the command to type.
+(denoise, sfm, place); otherwise (ingest, train) an error names the command to type.
 
 A target's options are defaults < recon.toml < --config < command line. Every other stage keeps the
 options of its result, unless recon.toml, --config or --set say otherwise (see `freshness`).
@@ -247,17 +247,17 @@ def _need_error(checks: WorkspaceCheck, check: StageCheck, reader: str) -> Stage
 def command(checks: WorkspaceCheck, check: StageCheck) -> str:
     """Returns the command, without `recon`, that updates a stage with the options it had."""
     words = [check.row.verb]
-    found = [(one.row, latest) for one in checks.siblings(check.row)
-             if (latest := one.partial_run or one.manifest)]
-    if not found:
+    keys = [latest.key for one in (check, *checks.siblings(check.row))
+            if (latest := one.partial_run or one.manifest)]
+    if not keys:
         return " ".join([*words, check.row.input_metavar] if check.row.input_metavar else words)
-    for row, latest in found:
-        config, default = checks.config(row, latest.key), checks.config(row, None)
-        for item in dataclasses.fields(row.config):
-            value, info = getattr(config, item.name), option_info(item)
-            if (value not in (None, getattr(default, item.name)) and info.hashed
-                    and (row.options is None or item.name in row.options)):
-                words += _option_words(item.name, value, info)
+    key = dataclasses.replace(keys[0], config={
+        name: value for each in keys for name, value in each.config.items()})
+    config, default = checks.config(check.row, key), checks.config(check.row, None)
+    for item in dataclasses.fields(check.row.config):
+        value, info = getattr(config, item.name), option_info(item)
+        if value not in (None, getattr(default, item.name)) and info.hashed:
+            words += _option_words(item.name, value, info)
     return shlex.join(words)
 
 

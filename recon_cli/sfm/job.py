@@ -28,7 +28,6 @@ from recon_cli.workspace.json_record import JsonRecord
 from recon_cli.workspace.steps import StepFolder
 
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
-PLACED = "placed.json"  # in the folder of place, until the parent reads it: `PlacedPart`
 DATABASE = "database.db"  # in the stage's folder: COLMAP's, of features and matches
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
 POLL_SECONDS = 0.25  # between looks at what native code has done
@@ -171,7 +170,7 @@ class MappingJob(JsonRecord):
 class PlaceJob(JsonRecord):
     """One part of a capture, to be moved into the world frame and undistorted."""
 
-    steps: ClassVar = ("undistorted",)  # that take long
+    steps: ClassVar = ("undistorted",)  # which leaves a `PlacedPart`
 
     frames: Path  # folder of the original frames
     denoised: Path  # folder of their denoised twins, under the same names

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from recon_cli.sfm.job import MappingJob
-from recon_cli.workspace.json_record import KEY, JsonRecord
+from recon_cli.workspace.json_record import JsonRecord
 from recon_cli.workspace.steps import StepFolder
-from recon_cli.workspace.summaries import AttemptSummary, PartSummary, PosesSummary
+from recon_cli.workspace.summaries import MappedParts
 
 Names = tuple[str, ...]
 
@@ -53,17 +53,8 @@ class SplitResult(StepResult):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelResult(StepResult):
-    """The parts of the capture, and how they were found; see `SfmSummary`."""
-
-    parts: tuple[PartSummary, ...]  # that which shows most first
-    models: tuple[int, ...]
-    poses: PosesSummary | None = field(default_factory=lambda: None)
-    apart: tuple[Names, ...] = ()
-    attempts: tuple[AttemptSummary, ...] = field(default=(), metadata={KEY: "rungs"})
-    broken: tuple[str, ...] = ()
-    left_out: Names = ()
-    notes: tuple[str, ...] = ()
+class ModelResult(StepResult, MappedParts):
+    """What the mapper and its fallbacks found."""
 
 
 # By step; see `job.STEPS`.

@@ -108,11 +108,11 @@ STAGES: tuple[Stage, ...] = (
           "recon_cli.stages.denoise"),
     Stage("sfm", "sfm", ("ingest",), (), SfmConfig, SfmSummary, 5, True,
           "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json*", "verdict.json", "segments.json"),
+          ("database.db", "log.txt", "steps.json*", "segments.json"),
           own_digests=True, options=tuple(
               item.name for item in fields(SfmConfig) if item.name not in _PLACE_OPTIONS)),
     Stage("place", "sfm", ("ingest", "denoise", "sfm"), (), SfmConfig, PlaceSummary, 1, True,
-          "recon_cli.stages.place", ("log.txt", "verdict.json"), own_digests=True,
+          "recon_cli.stages.place", ("log.txt", "steps.json*", "verdict.json"), own_digests=True,
           options=_PLACE_OPTIONS),
     Stage("train", "train", ("ingest", "place"), (), TrainConfig, TrainSummary, 5, False,
           "recon_cli.stages.train", ("log.jsonl", "plan.json"),

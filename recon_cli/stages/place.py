@@ -6,7 +6,7 @@ needs no new mapping. Denoised twins of the frames take their cameras.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
@@ -20,14 +20,7 @@ from recon_cli.sfm.mapping.trusted_part import JOIN_PANORAMAS
 from recon_cli.sfm.poses.align_world import find_places
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import POSES, FrameList, describe_stretches
-from recon_cli.workspace.summaries import (
-    AttemptSummary,
-    PartSummary,
-    PlacedPart,
-    PlaceSummary,
-    PosesSummary,
-    SfmSummary,
-)
+from recon_cli.workspace.summaries import PlacedPart, PlaceSummary, SfmSummary
 
 STRETCHES = 8  # of frames without a camera, in a sentence
 
@@ -43,8 +36,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     ingest, denoise, mapped = (
         inputs.folders[name].resolve() for name in ("ingest", "denoise", "sfm"))
     frames = store.read_frame_list(ingest)
-    found = inputs.read_summary("sfm", SfmSummary)
-    _refuse_missing_part(config.part, found.parts)
+    found = SfmSummary.from_json(inputs.summaries["sfm"])
+    _refuse_missing_part(config.part, found)
     job = PlaceJob(
         frames=ingest / store.FOLDER, denoised=denoise / store.FOLDER,
         masks=ingest / store.MASKS if any(frame.masked for frame in frames.frames) else None,
@@ -63,9 +56,9 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
     return summary
 
 
-def _refuse_missing_part(number: int, parts: Sequence[PartSummary]) -> None:
+def _refuse_missing_part(number: int, found: SfmSummary) -> None:
     """Raises ConfigError where the capture has no part of this number."""
-    sizes = [len(part.names) for part in parts]
+    sizes = [len(part.names) for part in found.parts]
     if number <= len(sizes):
         return
     named = ", ".join(f"{number} of {size} frames" for number, size in enumerate(sizes, 1))
@@ -95,7 +88,7 @@ def _report(summary: PlaceSummary, frames: FrameList, ctx: StageContext) -> None
     How a sound model was found, and how sure that is, stands in the log and the report.
     """
     sound = summary.trusted is not False and not (summary.broken or summary.left_out)
-    for sentence in (*_attempts(summary.attempts), *summary.lines):
+    for sentence in (*_attempts(summary), *summary.lines):
         if sound:
             ctx.tell(sentence, detail=True)
         else:
@@ -107,13 +100,13 @@ def _report(summary: PlaceSummary, frames: FrameList, ctx: StageContext) -> None
     for sentence in (*_describe_parts(summary, frames),
                      *_describe_left_out(summary, frames, named=not sound)):
         ctx.notice(sentence)
-    for sentence in (*_movement(summary.poses), *summary.world.sentences):
+    for sentence in (*_movement(summary), *summary.world.sentences):
         ctx.tell(sentence)
 
 
-def _attempts(attempts: Sequence[AttemptSummary]) -> Iterator[str]:
+def _attempts(summary: PlaceSummary) -> Iterator[str]:
     """Yields a sentence for each mapper that was tried after the first."""
-    for before, attempt in pairwise(attempts):
+    for before, attempt in pairwise(summary.attempts):
         reason = attempt.reason[:1].lower() + attempt.reason[1:].rstrip(".")  # may be a sentence
         if attempt.reason == before.reason:
             reason = "that was so again"
@@ -126,8 +119,9 @@ def _attempts(attempts: Sequence[AttemptSummary]) -> Iterator[str]:
                    f"{'; this model is used' if attempt.kept else ''}.")
 
 
-def _movement(poses: PosesSummary | None) -> Iterator[str]:
+def _movement(summary: PlaceSummary) -> Iterator[str]:
     """Yields a sentence on how far refining moved the given cameras."""
+    poses = summary.poses
     if poses and poses.moved_median is not None:
         yield (f"Refining moved the cameras by {poses.moved_median:.2%} of the size of their "
                f"path (at most {poses.moved_max:.2%}) and turned them by "

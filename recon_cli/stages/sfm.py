@@ -6,6 +6,7 @@ in the frame of the mapper; `place` moves one of them into the world.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 from recon_cli.config.stages import SfmConfig
@@ -22,14 +23,9 @@ from recon_cli.sfm.poses.align_world import find_places
 from recon_cli.sfm.results import MappingResult
 from recon_cli.sfm.segments import segments
 from recon_cli.workspace import records as store
-from recon_cli.workspace.records import (
-    POSES,
-    FrameList,
-    KnownPoses,
-    read_poses,
-)
+from recon_cli.workspace.records import POSES, FrameList, KnownPoses, read_poses
 from recon_cli.workspace.steps import StepFolder
-from recon_cli.workspace.summaries import SfmSummary
+from recon_cli.workspace.summaries import MappedParts, SfmSummary
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.
 MAX_MINUTES, USUAL_FRAMES, MINUTES_PER_FRAME = 20.0, 100, 0.2
@@ -175,10 +171,8 @@ def _times(frames: FrameList, tracks: Path) -> dict[str, float]:
 def _summary(frames: FrameList, runs: segments.SegmentRuns, found: MappingResult) -> SfmSummary:
     job, model = runs.job, found.model
     return SfmSummary(
-        frames=len(frames.frames), poses=model.poses, models=model.models, apart=model.apart,
-        attempts=model.attempts, seconds=found.seconds, left_out=model.left_out,
-        parts=model.parts, broken=model.broken, notes=model.notes,
-        segments=max(1, len(job.segments)),
+        **{item.name: getattr(model, item.name) for item in fields(MappedParts)},
+        frames=len(frames.frames), seconds=found.seconds, segments=max(1, len(job.segments)),
         cpu_seconds={
             **{f"{step} of segments": seconds for step, seconds in runs.cpu_seconds.items()},
             **found.cpu_seconds})

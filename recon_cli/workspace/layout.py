@@ -64,18 +64,17 @@ class Workspace:
         return (self.root / "ingest" / "manifest.json").is_file()
 
     def folder(self, stage: str) -> Path:
-        """Returns where a stage's finished result lies or will lie."""
-        return self._target("sfm" if stage == "place" and self._sfm_placed else stage)
+        """Returns where a stage's finished result lies or will lie.
+
+        That of `place` lies in sfm/ where sfm has made the views, as an earlier version did.
+        """
+        own, sfm = self._target(stage), self._target("sfm")
+        earlier = stage == "place" and not os.path.lexists(own) and (sfm / "undistorted").is_dir()
+        return sfm if earlier else own
 
     def _target(self, stage: str) -> Path:
         """Returns where a stage's next result will lie."""
         return self.root / stage.partition(".")[0]
-
-    @property
-    def _sfm_placed(self) -> bool:
-        """Whether sfm has made the views, as before `place` was a stage of its own."""
-        return not os.path.lexists(self._target("place")) and (
-            self._target("sfm") / "undistorted").is_dir()
 
     def partial(self, stage: str) -> Path:
         """Returns where a stage writes before it is finished."""

@@ -135,19 +135,25 @@ class PartSummary(JsonRecord):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SfmSummary(JsonRecord):
-    """The models that sfm found."""
+class MappedParts(JsonRecord):
+    """The parts of a capture, and how they were found."""
 
-    frames: int  # of ingest
     poses: PosesSummary | None  # None without known poses
     models: tuple[int, ...]  # frames in the model and in what is left of the others
     apart: tuple[tuple[str, ...], ...]  # names of the frames that only other models hold
     attempts: tuple[AttemptSummary, ...] = field(metadata={KEY: "rungs"})
-    seconds: Mapping[str, float]  # by step
     left_out: tuple[str, ...] = ()  # names of the frames whose camera is in no part
     parts: tuple[PartSummary, ...] = ()  # that which shows most first; none in older results
     broken: tuple[str, ...] = ()  # why the model was cut, sentences; none where it was not
     notes: tuple[str, ...] = ()  # sentences on how it was found
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmSummary(MappedParts):
+    """The models that sfm found."""
+
+    frames: int  # of ingest
+    seconds: Mapping[str, float]  # by step
     segments: int = 1  # that were mapped apart and joined; 1 for a capture mapped as a whole
     cpu_seconds: Mapping[str, float] | None = None  # by step; those of segments together
 

@@ -217,8 +217,7 @@ def test_a_good_capture_stops_at_the_first_attempt(tmp_path):
     assert result.models == (20,)
     assert not job.attempts.exists()
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-3
-    assert json.loads((job.model / "verdict.json").read_text()) == json.loads(
-        json.dumps(part.verdict))
+    assert json.loads((job.model / "verdict.json").read_text())["registered"] == 20
     assert json.dumps(result.to_json(), allow_nan=False)
 
 
@@ -258,7 +257,7 @@ def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypa
     monkeypatch.setattr(fallbacks.merge_models, "merge", lambda *_, **__: None)
     monkeypatch.setattr(fallbacks, "shortfall", lambda *_, **__: "")
     result = build(job)
-    assert sorted(each.registered for each in result.parts) == [job.names[:10], job.names[10:]]
+    assert sorted(each.names for each in result.parts) == [job.names[:10], job.names[10:]]
     assert result.apart == ()
     assert sorted(path.name for path in job.parts.iterdir()) == ["1", "2"]
 

@@ -205,7 +205,7 @@ def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monke
 
 def test_a_problem_of_the_model_before_goes_on_within_the_sentence():
     broken = attempt("global", reason="The model is broken.", registered=9)
-    line, = place._attempts([attempt("exhaustive"), broken])
+    line, = place._attempts(SimpleNamespace(attempts=[attempt("exhaustive"), broken]))
     assert_facts(line, "global", "the model is broken", "9 frames")
     assert ".:" not in line
 
@@ -215,7 +215,8 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted():
     frames = FrameList("video", (Group("a.mp4", 64, 48),), tuple(
         Frame(name, None, "a.mp4", None, held_out=name in ("0.png", "4.png")) for name in names))
     part = PartSummary(names=tuple(names[:3]), points=9)
-    model = ModelResult(parts=(part,), models=(3,), left_out=tuple(names[3:5]))
+    model = ModelResult(parts=(part,), models=(3,), poses=None, apart=(), attempts=(),
+                        left_out=tuple(names[3:5]))
     found = sfm._summary(frames, SegmentRuns(SimpleNamespace(segments=()), {}, {}),
                          MappingResult(model, {}, {}))
     summary = place._summary(frames, found, 1, PlacedPart(

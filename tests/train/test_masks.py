@@ -41,8 +41,8 @@ def regions(*rows):
 
 
 def finished(out, **changes):
-    return EarlierResult(out, {}, **{name: frozenset(f"masks/{file}" for file in files)
-                                     for name, files in changes.items()})
+    return EarlierResult(out, **{name: frozenset(f"masks/{file}" for file in files)
+                                 for name, files in changes.items()})
 
 
 def counts(path):

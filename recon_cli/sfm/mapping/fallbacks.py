@@ -442,7 +442,7 @@ def _publish_best(
     apart = [tuple(sorted(set(names) - held)) for names in chosen.apart]
     return ModelResult(
         parts=tuple(parts.list_part(part.model, part.rejected) for part in delivered),
-        models=(len(chosen.registered), *chosen.models[1:]),
+        poses=None, models=(len(chosen.registered), *chosen.models[1:]),
         apart=tuple(names for names in apart if len(names) >= MIN_FRAMES),
         broken=() if job.accept_weak else verdict.problems,
         left_out=tuple(sorted(set(chosen.registered) - held)),

@@ -22,19 +22,10 @@ from recon_cli.errors import ExitCode, ReconError, SfmError, format_count, name_
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
-from recon_cli.sfm.job import (
-    LOCK,
-    PLACED,
-    POLL_SECONDS,
-    Event,
-    MappingJob,
-    Phase,
-    PlaceJob,
-    parse,
-)
-from recon_cli.workspace.atomic import read_json, write_json
+from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, PlaceJob, parse
+from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.disk import refuse_full_disk
-from recon_cli.workspace.steps import make_way
+from recon_cli.workspace.steps import StepFolder, make_way
 from recon_cli.workspace.summaries import PlacedPart
 
 _DOING = {
@@ -160,9 +151,8 @@ def place_part(
     contradicts itself.
     """
     _run(job, math.inf, Monitor(job, progress, record, lambda: None))
-    path = job.out / PLACED
-    placed = PlacedPart.from_json(read_json(path, dict))
-    path.unlink()
+    placed = StepFolder(job.out).find(job.steps[-1], PlacedPart)
+    assert placed is not None, "the mapping process ended without a result"
     return placed
 
 

@@ -204,7 +204,7 @@ def _write(
     shutil.rmtree(job.attempts, ignore_errors=True)
     return ModelResult(
         parts=(parts.list_part(model),), notes=tuple(notes),
-        models=(model.num_reg_images(),), poses=poses)
+        models=(model.num_reg_images(),), poses=poses, apart=(), attempts=())
 
 
 def _read_poses(job: MappingJob) -> KnownPoses:

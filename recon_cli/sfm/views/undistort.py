@@ -26,7 +26,7 @@ from recon_cli.room.scale import ScaleBetween
 from recon_cli.scene.camera import Lens
 from recon_cli.scene.faces import is_cube_face, view_name
 from recon_cli.sfm.features.sphere import is_panorama
-from recon_cli.sfm.job import PLACED, VERDICT, PlaceJob, Reporter, fresh_folder
+from recon_cli.sfm.job import VERDICT, PlaceJob, Reporter, fresh_folder
 from recon_cli.sfm.mapping.mapper import triangulation_angles
 from recon_cli.sfm.model_arrays import registered_images, viewmat_of
 from recon_cli.sfm.poses.align_world import refuse_contradiction, world_transform
@@ -44,6 +44,7 @@ from recon_cli.sfm.views.flat_views import (
 )
 from recon_cli.sfm.views.undistort_faces import write_views
 from recon_cli.workspace import atomic
+from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import PlacedPart, WorldSummary
 
 IMAGES, TWINS, SPARSE, MASKS = "images", "denoised", "sparse", "masks"
@@ -69,7 +70,7 @@ def place(job: PlaceJob, report: Reporter) -> None:
             float(np.median(triangulation_angles(model))) if tracks else None),
         verdict=verdict.to_json() if verdict else None, lines=lines if verdict else (),
         world=place_model(job, model, verdict), cameras=undistort(job, report))
-    atomic.write_json(job.out / PLACED, placed.to_json())
+    StepFolder(job.out).finish(job.steps[-1], placed)
 
 
 def place_model(
