@@ -80,7 +80,7 @@ def score(workspace: Path, taken: list[Shot], metric: bool) -> dict[str, Any]:
     """Returns the figures of a row."""
     which = match_shots(workspace / "ingest", taken)
     found = {name: np.linalg.inv(viewmat) for name, _, viewmat in read_images(
-        workspace / "sfm" / "sparse" / "images.bin")}
+        workspace / "place" / "sparse" / "images.bin")}
     ours = np.stack(list(found.values()))
     truth = np.stack([taken[which[name]].c2w for name in found])
     scale, _ = similarity(ours[:, :3, 3], truth[:, :3, 3])
@@ -91,7 +91,7 @@ def score(workspace: Path, taken: list[Shot], metric: bool) -> dict[str, Any]:
     off = np.linalg.norm(apart - apart.mean(axis=0), axis=1)
     turns = Rotation.from_matrix(
         (turn.as_matrix() @ ours[:, :3, :3]).transpose(0, 2, 1) @ truth[:, :3, :3]).magnitude()
-    world = read_json(workspace / "sfm" / "world.json")["evidence"]
+    world = read_json(workspace / "place" / "world.json")["evidence"]
     up = turn.apply([0.0, 0.0, 1.0])
     return {"frames": len(found), "of": len(which), "scale": scale - 1, "rmse": float(
         np.sqrt((off**2).mean())), "turn": float(np.degrees(turns.max())),

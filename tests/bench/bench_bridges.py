@@ -284,8 +284,7 @@ def write_job(views: Mapping[str, View], folder: Path) -> MappingJob:
             CameraGroup(tuple(sorted(names)), *size) for size, names in sorted(sizes.items())),
         masks=None, poses=None, pose_use="ignore", given_points=False, pairs="auto",
         max_features=3000, min_registered=0.1, accept_weak=False, partial=True,
-        max_minutes=60, seed=0, threads=1, sharpness={}, times={},
-        last="sparse")
+        max_minutes=60, seed=0, threads=1, sharpness={}, times={})
 
 
 def count_bridges(views: Mapping[str, View], folder: Path) -> list[str]:

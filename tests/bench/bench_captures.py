@@ -205,8 +205,8 @@ def measured(name: str, data: Path, out: Path) -> list[str]:
             return [name, *[""] * (len(HEADINGS) - 2), f"exit {done.code}: {done.error}"]
     manifest = read_json(workspace / "sfm" / "manifest.json")
     cells = accuracy(capture, data, out)
-    summary = manifest["summary"]
-    verdict = read_json(workspace / "sfm" / "verdict.json")
+    summary = read_json(workspace / "place" / "manifest.json")["summary"]
+    verdict = read_json(workspace / "place" / "verdict.json")
     return [
         name, str(summary["frames"]), str(summary["registered"]), str(len(summary["left_out"])),
         next((rung["name"] for rung in summary["rungs"] if rung["kept"]), "given poses"),
@@ -227,7 +227,7 @@ def accuracy(capture: Capture, data: Path, out: Path) -> tuple[str, str, str]:
     """Cells on the errors of the cameras."""
     if capture.truth is None:
         return "", "", ""
-    errors = compare(model_poses(out / "ws" / "sfm" / "sparse"), capture.truth(data, out))
+    errors = compare(model_poses(out / "ws" / "place" / "sparse"), capture.truth(data, out))
     return (
         f"{100 * errors.rmse:.2f} cm" if capture.metric else "",
         f"{errors.median_share:.2%} / {errors.max_share:.2%}",

@@ -92,9 +92,9 @@ def measure(workspace: Path, name: str, truth: Poses) -> tuple[str, ...]:
 
 def describe_finished(workspace: Path, truth: Poses | None) -> tuple[str, ...]:
     """Returns the cells of the model that a workspace holds."""
-    summary = read_json(workspace / "sfm" / "manifest.json")["summary"]
+    summary = read_json(workspace / "place" / "manifest.json")["summary"]
     way = next((rung["name"] for rung in summary["rungs"] if rung["kept"]), "given poses")
-    own = model_poses(workspace / "sfm" / "sparse")
+    own = model_poses(workspace / "place" / "sparse")
     return (f"recon ({way})", str(summary["registered"]), str(len(summary["models"])),
             str(summary["points"]), f"{summary['reprojection_error_px']:.3f}",
             "" if truth is None else errors(own, truth), f"{summary['cpu_seconds']['model']:.1f}")
@@ -110,11 +110,11 @@ def main(workspaces: tuple[str, ...], names: tuple[str, ...]) -> None:
     for text in workspaces:
         place, _, given = text.partition("=")
         workspace = Path(place)
-        if not (workspace / "sfm" / "manifest.json").exists():
+        if not (workspace / "place" / "manifest.json").exists():
             raise FormatError(f"{workspace} has no finished sfm.",
                               hint="Run `recon sfm` there first.")
         truth = reference_poses(Path(given)) if given else None
-        own = model_poses(workspace / "sfm" / "sparse")
+        own = model_poses(workspace / "place" / "sparse")
         for cells in (describe_finished(workspace, truth),
                       *(measure(workspace, name, truth or own) for name in names)):
             own_row = cells[0].startswith("recon")

@@ -19,7 +19,7 @@ from recon_cli.train.plan import QUALITIES
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import EvaluateSummary, TrainSummary
 
-STAGES = ("ingest", "denoise", "sfm", "train", "prune", "evaluate", "export")
+STAGES = ("ingest", "denoise", "sfm", "place", "train", "prune", "evaluate", "export")
 
 
 def describe_run(workspace: Workspace, wall: float) -> list[str]:

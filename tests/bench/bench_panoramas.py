@@ -57,7 +57,7 @@ def main(data: Path) -> None:
             seconds = find_cameras(folder / "images", workspace)
             truth = np.loadtxt(folder / "pano_traj.txt").reshape(-1, 4, 4)[:, :3, 3]
             names = [path.name for path in sorted((folder / "images").iterdir())]
-            found = read_centers(workspace / "sfm" / "sparse", workspace)
+            found = read_centers(workspace / "place" / "sparse", workspace)
             rows = [names.index(name) for name in found]
             off = errors(np.stack(list(found.values())), truth[rows])
             click.echo(f"{room}: {len(found)} of {len(names)}, RMSE "

@@ -60,8 +60,8 @@ def row(apartment: Path, count: int, workspace: Path, options: tuple[str, ...]) 
     if code:
         return {**cells, "ended with": f"exit {code}: {error}"}
     manifest = read_json(workspace / "sfm" / "manifest.json")
-    summary = manifest["summary"]
-    errors = compare(model_poses(workspace / "sfm" / "sparse"),
+    summary = read_json(workspace / "place" / "manifest.json")["summary"]
+    errors = compare(model_poses(workspace / "place" / "sparse"),
                      reference_poses(apartment / "traj.txt"))
     truth = np.array([pose[:3, 3] for pose in reference_poses(apartment / "traj.txt").values()])
     extent = float(np.linalg.norm(np.ptp(truth[:count], axis=0)))

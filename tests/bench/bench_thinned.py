@@ -244,7 +244,7 @@ def map_photos(job: MappingJob, folder: Path, *, bridges: bool) -> None:
     start, refused = time.process_time(), ""
     try:
         with mock.patch.object(xfeat_weights, "are_installed", return_value=bridges):
-            worker.work(dataclasses.replace(job, last="sparse"), quiet())
+            worker.work(job, quiet())
     except ReconError as error:
         refused = error.message
     (folder / RESULT).write_text(json.dumps(

@@ -35,7 +35,7 @@ def main(source: Path, rounds: int, threads: int, iterations: int) -> None:
     seconds: dict[str, list[tuple[float, float]]] = {kind: [] for kind in KINDS}
     with tempfile.TemporaryDirectory() as folder:
         workspace = Path(folder) / "ws"
-        for stage in ("ingest", "denoise", "sfm"):
+        for stage in ("ingest", "denoise", "sfm", "place"):
             shutil.copytree(source / stage, workspace / stage)
         results = set()
         for number in range(rounds):

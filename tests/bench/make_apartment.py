@@ -63,7 +63,7 @@ class Room:
 def load(workspace: Path, size: tuple[float, float, float], *, mirrored: bool) -> Room:
     """Returns a room of a workspace, in its own frame and without a door."""
     splats = read_ply(workspace / "train" / "splats.ply").with_degree(0)
-    images = read_images(workspace / "sfm" / "undistorted" / "sparse" / "images.bin")
+    images = read_images(workspace / "place" / "undistorted" / "sparse" / "images.bin")
     path = [np.linalg.inv(viewmat) for name, _, viewmat in sorted(images, key=lambda i: i[0])
             if name.startswith("frame")]
     box = torch.tensor(size)

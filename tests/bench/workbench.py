@@ -28,11 +28,12 @@ from recon_cli.train.fit.task import Task
 from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.plan import first_count
 from recon_cli.workspace import records
+from recon_cli.workspace.layout import Workspace
 
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 workspace_argument = click.argument("workspace", type=FOLDER)
 workspaces_argument = click.argument("workspaces", nargs=-1, required=True, type=FOLDER)
-STAGES = ("ingest", "denoise", "sfm", "train")
+STAGES = ("ingest", "denoise", "sfm", "place", "train")
 
 
 def numba_context(threads: int = 1) -> StageContext:
@@ -43,7 +44,7 @@ def numba_context(threads: int = 1) -> StageContext:
 
 def stage_folders(workspace: Path) -> dict[str, Path]:
     """Returns the folders of a workspace's stages by name."""
-    return {name: workspace / name for name in STAGES}
+    return {name: Workspace(workspace).folder(name) for name in STAGES}
 
 
 def open_scene(workspace: Path, validation: float) -> Scene:
@@ -119,7 +120,7 @@ def mapping_job(ingest: Path, out: Path, **changes: Any) -> MappingJob:
     fields = {
         "masks": None, "poses": None, "pose_use": "ignore", "given_points": False, "pairs": "auto",
         "max_features": 3000, "min_registered": 0.5, "accept_weak": False, "partial": False,
-        "gravity": False, "scale_between": None, "max_minutes": 60.0, "seed": 0, "threads": 1,
+        "max_minutes": 60.0, "seed": 0, "threads": 1,
         "sharpness": {}, "times": {}, **changes}
     return MappingJob(frames=ingest / records.FOLDER, out=out,
                       groups=groups, **fields)

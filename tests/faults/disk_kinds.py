@@ -69,7 +69,7 @@ def _words(case: Case, verb: str, workspace: Path) -> tuple[tuple[str, ...], set
     words = [word for word in FULL[verb] if word != "--again"]
     if verb == "ingest":
         words.append(str(lab.clip))
-    tops = {verb} & {"sfm", "train"} or owned(verb)
+    tops = {"sfm": {"sfm", "place"}, "train": {"train"}}.get(verb) or owned(verb)
     return (*words, "-w", str(workspace)), tops, lab.tiny
 
 

@@ -44,7 +44,8 @@ _SCENE = Path("train") / "splats.ply"
 
 def _names(verb: str) -> list[str]:
     """Returns the names at the top of a workspace in which a verb leaves its own result."""
-    return sorted({"sfm": {"sfm"}, "train": {"train"}, "clean": set()}.get(verb, owned(verb)))
+    return sorted({"sfm": {"sfm", "place"}, "train": {"train"}, "clean": set()}.get(
+        verb, owned(verb)))
 
 
 # ---- other versions of recon ----

@@ -182,8 +182,8 @@ def lost_files(before: dict[str, str], folder: Path, spare: Callable[[str], bool
 def owned(verb: str, words: Sequence[str] = ()) -> set[str]:
     """Returns the names at the top of a workspace that a verb may replace."""
     stages = {
-        "ingest": {"ingest"}, "denoise": {"denoise"}, "sfm": {"denoise", "sfm"},
-        "train": {"denoise", "sfm", "train"}, "import": {"train"}, "prune": {"prune"},
+        "ingest": {"ingest"}, "denoise": {"denoise"}, "sfm": {"denoise", "sfm", "place"},
+        "train": {"denoise", "sfm", "place", "train"}, "import": {"train"}, "prune": {"prune"},
         "eval": {"evaluate"}, "export": {"export"}, "run": {*STAGES, "report.html"},
         "render": {"render"}, "report": {"report.html"}, "status": set(), "batch": set(STAGES),
         "clean": {"sfm", "blocks", "seeds", *words}}[verb]

@@ -50,7 +50,7 @@ def _set_up(case: Case, verb: str) -> tuple[Path, tuple[str, ...], Path, set[str
         workspace = case.workspace(without=("train", "prune"))
         words = ("train", "--prune", "-w", str(workspace))
         return workspace, words, lab.root / "mid", {"train", "prune"}
-    tops = {"clean": set(STAGES) - {"sfm"}, "sfm": {"sfm"}, "train": {"train"}}.get(
+    tops = {"clean": set(STAGES) - {"sfm"}, "sfm": {"sfm", "place"}, "train": {"train"}}.get(
         verb, owned(verb))
     again = case.rng.random() < 0.4
     without = () if again or verb in ("status", "clean") else tuple(tops)

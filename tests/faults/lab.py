@@ -24,8 +24,8 @@ from moments import Moments, sending
 from phone_writers import pack
 
 SAMPLE = Path(__file__).resolve().parents[2] / "recon_cli" / "samples" / "room.mp4"
-STAGES = ("ingest", "denoise", "sfm", "train", "prune", "evaluate", "export")
-VERBS = {stage: stage for stage in STAGES} | {"evaluate": "eval"}  # by stage
+STAGES = ("ingest", "denoise", "sfm", "place", "train", "prune", "evaluate", "export")
+VERBS = {stage: stage for stage in STAGES} | {"evaluate": "eval", "place": "sfm"}  # by stage
 LIMIT = 60.0  # seconds for a command; sound ones take 0.1 to 3 on an idle core
 SETTINGS = """\
 [ingest]
@@ -233,7 +233,8 @@ def _interrupt(lab: Lab, stage: str, rng: random.Random) -> None:
     for _ in range(20):
         target = copy(lab.tiny, lab.half(stage), without=later)
         moments = Moments(target)
-        at = max(3, int(rng.uniform(0.35, 0.8) * lab.moments[verb]))
+        least = 0.0 if stage == "place" else 0.35  # the second half of its verb alone
+        at = max(3, int(rng.uniform(least, 0.8) * lab.moments[verb]))
         words = (verb, *((str(lab.clip),) if stage == "ingest" else ()), "-w", str(target))
         running = start(
             words, cwd=lab.root,

@@ -61,7 +61,7 @@ def pair(case: Case) -> Verdict:
         again = case.run(*words[1])
         if again.code:
             return wrong(Outcome.BUG, again, f"fails after {first} is done")
-    names = {"sfm": {"sfm"}, "train": {"train"}, "clean": set()}
+    names = {"sfm": {"sfm", "place"}, "train": {"train"}, "clean": set()}
     tops = set().union(*(names.get(verb, owned(verb)) for verb in (first, second)))
     wrongs = differing(case.lab, workspace, sorted(tops - {"report.html"}))
     if wrongs:

@@ -86,7 +86,7 @@ CHANGES: dict[str, Change] = {
     "gone": lambda path, _outside: _gone(path)}
 _PLACES = (*STAGES, ".partial", ".partial/train", ".partial/train.json", ".partial/eval", ".old",
            ".old/train", ".old/junk", ".lock", ".lock.json", "recon.log", "recon.toml", "render",
-           "report.html", "blocks", "seeds", "seeds/1", "ingest/frames", "sfm/undistorted",
+           "report.html", "blocks", "seeds", "seeds/1", "ingest/frames", "place/undistorted",
            "sfm/parts/1", "train/manifest.json", "recon.toml", "render/test")
 
 
@@ -134,7 +134,7 @@ def _judge(case: Case, workspace: Path, verb: str, words: tuple[str, ...], top: 
         return RIGHT
     if top == "prune" and verb in ("eval", "export") and not (workspace / top).is_dir():
         return RIGHT  # they do without a pruned model where there is none
-    names = {"train": {"train"}, "sfm": {"sfm"}}.get(verb, owned(verb))
+    names = {"train": {"train"}, "sfm": {"sfm", "place"}}.get(verb, owned(verb))
     wrongs = [] if top == "recon.toml" else differing(case.lab, workspace, sorted(names))
     if wrongs and not new_notices(case.lab, verb, done):
         return wrong(Outcome.SILENTLY_WRONG, done, f"not as without the fault: {wrongs[:5]}")

@@ -30,7 +30,8 @@ from lab import FULL, STAGES, VERBS
 # verbs that read the result of a stage
 _READERS = {
     "ingest": ("denoise", "sfm", "train", "eval"), "denoise": ("sfm", "train"),
-    "sfm": ("train", "prune", "eval", "export"), "train": ("prune", "eval", "export"),
+    "sfm": ("sfm", "train", "eval"), "place": ("train", "prune", "eval", "export"),
+    "train": ("prune", "eval", "export"),
     "prune": ("eval", "export", "render"), "evaluate": ("report", "status", "eval"),
     "export": ("report", "status", "export"), "render": ("render", "report"),
     "report.html": ("report",)}
@@ -108,7 +109,7 @@ def _judge_success(case: Case, workspace: Path, name: Path, verb: str, done: Fin
     if verb == "clean":
         return RIGHT
     wrongs = differing(lab, workspace, sorted({
-        "sfm": {"sfm"}, "train": {"train"}}.get(verb, owned(verb))))
+        "sfm": {"sfm", "place"}, "train": {"train"}}.get(verb, owned(verb))))
     if not wrongs or new_notices(lab, verb, done):
         return RIGHT
     if verb == "report" and wrongs == ["report.html"]:

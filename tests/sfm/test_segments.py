@@ -226,7 +226,7 @@ def test_photos_are_split_by_the_mapping_process(job, monkeypatch):
     Path(photos.out).mkdir()
     runs = run(photos, monkeypatch, Splitter(), count=2)
     assert runs.job.segments == tuple(parts)
-    assert runs.job.steps == ("features", "matches", "split", "model", "sparse", "undistorted")
+    assert runs.job.steps == ("features", "matches", "split", "model")
 
 
 def test_the_folders_of_segments_are_removed(job, monkeypatch):

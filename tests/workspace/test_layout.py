@@ -33,7 +33,7 @@ class Killed(BaseException):
 
 
 def key(config: int = 1) -> ResultKey:
-    return ResultKey("train", 1, {"iterations": config}, (), {"sfm": "abc"})
+    return ResultKey("train", 1, {"iterations": config}, (), {"place": "abc"})
 
 
 def finish(workspace: Workspace, text: str, config: int = 1) -> Manifest:

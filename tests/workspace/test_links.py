@@ -15,7 +15,7 @@ from recon_cli.workspace.layout import Workspace, has_link, move, remove, size_o
 from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord
 
 RUN = RunRecord(1.0, 2, {}, {}, None, None, 1, "2020-01-01T00:00:00+00:00")
-KEY = ResultKey("train", 1, {"iterations": 1}, (), {"sfm": "abc"})
+KEY = ResultKey("train", 1, {"iterations": 1}, (), {"place": "abc"})
 
 
 def finish(workspace: Workspace, text: str) -> None:
