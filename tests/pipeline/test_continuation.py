@@ -113,7 +113,7 @@ def test_an_interrupted_run_whose_start_is_gone_begins_anew(job: Job) -> None:
     fake_stages.actions.clear()
     write_bytes(job.workspace.partial("train") / "kept.txt", b"of the interrupted run")
     shutil.rmtree(job.workspace.folder("train"))
-    assert plan.status(job)[3].state == "missing"
+    assert plan.status(job)[4].state == "missing"
     bring(job, "train", changes=longer(6000))
     assert manifest(job).key.continues is None
     assert not (job.workspace.folder("train") / "kept.txt").exists()
