@@ -171,7 +171,7 @@ def test_status_shows_state_and_reason(capsys: Said) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[1:]] == [*NAMES, PAGE]
     assert "fresh" in lines[1]
-    assert "train.iterations changed: automatic -> 7" in lines[4]
+    assert "train.iterations changed: automatic -> 7" in lines[1 + NAMES.index("train")]
 
 
 def test_status_as_json_has_stable_keys(capsys: Said) -> None:

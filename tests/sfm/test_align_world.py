@@ -10,14 +10,13 @@ import pycolmap
 import pytest
 from rooms import degrees_between, make_room
 from scipy.spatial.transform import Rotation
-from synthetic import make_capture
+from synthetic import make_capture, place_job
 from test_similarity import random_similarity
 
 from recon_cli.errors import ConfigError, SfmError
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.mapping.parts import write_parts
 from recon_cli.sfm.poses.align_world import WorldFrame, refuse_contradiction, world_transform
 from recon_cli.sfm.segments.shared_points import to_sim3d
 from recon_cli.sfm.views import undistort
@@ -134,8 +133,7 @@ def test_a_room_without_a_floor_says_so():
 
 
 @pytest.mark.parametrize(("lean_deg", "found"), [(0.5, True), (25.0, False)])
-def test_level_panoramas_that_face_one_way_show_up_without_a_floor(tmp_path, monkeypatch, lean_deg,
-                                                                   found):
+def test_level_panoramas_that_face_one_way_show_up_without_a_floor(tmp_path, lean_deg, found):
     rng = np.random.default_rng(0)
     world = Rotation.from_euler("xz", [70, 20], degrees=True)  # the mapper's frame
     model = pycolmap.Reconstruction()
@@ -150,9 +148,7 @@ def test_level_panoramas_that_face_one_way_show_up_without_a_floor(tmp_path, mon
     for place in rng.normal(size=(200, 3)):
         model.add_point3D(place, pycolmap.Track(), np.zeros(3, np.uint8))
     job, _ = make_capture(tmp_path, frames=3)
-    write_parts(job, [(model, None)])
-    monkeypatch.setattr(undistort, "check_part", lambda _: None)
-    placed = undistort.place_model(job).world
+    placed = undistort.place_model(place_job(job), model, None)
     assert placed.evidence.up_found == found
     up = -Similarity.from_json(placed.similarity).rotation @ world.inv().as_matrix()[:, 1]
     assert (degrees_between(up, np.array([0, 0, 1.0])) < 1) == found

@@ -54,7 +54,7 @@ def test_only_the_end_of_a_long_log_is_read(tmp_path):
 
 @pytest.mark.parametrize(("events", "idle"), [
     ([Phase("features", 4, 0), 4, Phase("matches", 6, 0), 5], 0),
-    ([Phase("matches", 6, 0), 5, 6, Phase("undistorted", 4, 0), 4], 1),
+    ([Phase("matches", 6, 0), 5, 6, Phase("mapping", 4, 0), 4], 1),
     ([Phase("matches", 6, 6)], 1),  # kept from an interrupted run
     ([Phase("mapping", 4, 0), 2, Phase("matches", 6, 6), Phase("mapping", 4, 0)], 1)])
 def test_a_core_is_reported_idle_once_when_all_pairs_are_matched(events, idle):
