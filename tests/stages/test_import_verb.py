@@ -153,7 +153,7 @@ def test_views_that_come_later_make_the_scene_stale_until_it_is_held_against_the
     assert recon("import", workspace, scene) == 0
     for name in ("ingest", "place"):
         (away / name).rename(workspace / name)
-    assert set(train_of(workspace).reasons) == {"ingest was missing", "sfm was missing"}
+    assert set(train_of(workspace).reasons) == {"ingest was missing", "place was missing"}
     assert recon("eval", workspace) == 4
     assert "recon import" in capsys.readouterr().err
     assert recon("import", workspace) == 0
