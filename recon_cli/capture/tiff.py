@@ -55,7 +55,7 @@ class TagValue(IntEnum):
 
 _COLOURS: dict[int, int] = {
     Photometric.WHITE_IS_ZERO: 1, Photometric.BLACK_IS_ZERO: 1, Photometric.RGB: 3,
-            Photometric.CMYK: 4}  # samples of a colour
+    Photometric.CMYK: 4}  # samples of a colour
 
 
 class UnsupportedError(ValueError):

@@ -63,7 +63,8 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
         values = np.array(np.load(path, mmap_mode="r"))  # refuses a shape that the file lacks
     except (OSError, ValueError, EOFError) as error:
         raise FormatError(f"{path} cannot be read: {error}.") from error
-    if values.ndim != 2 or values.shape[1] not in (15, 17) or values.dtype.kind not in "fiu":
+    # with the bounds, and without
+    if values.ndim != 2 or values.shape[1] not in (17, 15) or values.dtype.kind not in "fiu":
         raise FormatError(
             f"{path} holds {values.dtype} of shape {values.shape}; needed are 17 numbers a row.")
     return values[:, :15].astype(np.float64).reshape(-1, 3, 5)

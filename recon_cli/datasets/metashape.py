@@ -30,6 +30,7 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.workspace.atomic import read_text
 
 _MARKS = re.compile(rb"(?=.*<document)(?=.*<chunk)(?=.*<(?:sensor|camera))", re.DOTALL)
+_HEAD = 1 << 16  # bytes; sensors come before cameras
 _SKEW = 0.5  # pixels that leaving out b2 may move the border
 # On the earth's surface, from its centre: coordinates whose up is not z.
 _ECEF = (6.3e6, 6.4e6)  # metres
@@ -41,7 +42,7 @@ def find_metashape(path: Path) -> Path | None:
     """Returns the .xml of cameras in a folder, or that a file is."""
     files = [path] if path.is_file() else sorted(path.glob("*.xml"))
     return next((file for file in files if file.suffix.lower() == ".xml"
-                 and _MARKS.match(read_head(file))), None)
+                 and _MARKS.match(read_head(file, _HEAD))), None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,7 @@ _MOST_ENTRY = 1 << 28  # bytes; metadata of an hour take 100 MB
 # Pictures and LZFSE do not shrink any more; metadata, text of numbers, shrink to a third.
 _MOST_RATIO = 20
 _SPARE = 1 << 28  # bytes that stay free on the disk
+_STEP = 1 << 20
 
 
 def is_packed(path: Path) -> bool:
@@ -105,8 +106,10 @@ def _extract(
         raise FormatError(f"{path} holds {entry.filename}, which is encrypted or packed in a way "
                           "that Record3D does not use.", hint=_HINT)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with archive.open(entry) as source:
-        data = source.read(entry.file_size + 1)
-    if len(data) > entry.file_size:
-        raise FormatError(f"{path}: {entry.filename} holds more than it says.", hint=_HINT)
-    target.write_bytes(data)
+    written = 0
+    with archive.open(entry) as source, target.open("wb") as file:
+        while data := source.read(_STEP):
+            written += len(data)
+            if written > entry.file_size:
+                raise FormatError(f"{path}: {entry.filename} holds more than it says.", hint=_HINT)
+            file.write(data)

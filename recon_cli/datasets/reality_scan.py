@@ -77,7 +77,7 @@ def _lens(row: Mapping[str, str], size: tuple[int, int], where: str) -> Lens:
 
     width, height = size
     scale = max(size)
-    focal = number("f") * scale / 36
+    focal = number("f") * scale / 36  # millimetres of film, the longer side
     inner = (focal, focal, number("px") * scale + width / 2, number("py") * scale + height / 2)
     return radial_lens(size, inner, [number(key) for key in ("k1", "k2", "k3", "k4")],
                        (number("t1"), number("t2")), where)

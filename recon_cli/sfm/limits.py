@@ -49,9 +49,6 @@ MIN_PARALLAX_DEG = 2.0
 # Scale of Cauchy's loss, times the mean error. Cameras of two rooms came out at .54 and .47 cm
 # without it, at .34 and .19 with SHARP_RATIO of `mapper`, at .16 and .09 with both.
 LOSS_SCALE = 0.5
-# The same of fewer images than MIN_IMAGES_PRINCIPAL: their mean error is too small, since they
-# follow their points, and each observation is needed. See tests/bench/bench_thinned.py.
-FEW_LOSS_SCALE = 2.0
 
 # --- models
 MIN_FRAMES = store.MIN_FRAMES

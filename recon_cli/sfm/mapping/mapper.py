@@ -14,7 +14,6 @@ from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.sfm import database
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import (
-    FEW_LOSS_SCALE,
     LOSS_SCALE,
     MAX_ERROR_PX,
     MIN_FRAMES,
@@ -218,8 +217,7 @@ def sharpen(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     if any(sharp.image(i).num_points3D < KEPT_SHARE * model.image(i).num_points3D
            for i in model.reg_image_ids()):
         sharp = pycolmap.Reconstruction(model)
-    few = model.num_reg_images() < MIN_IMAGES_PRINCIPAL
-    adjust(sharp, loss_scale=(FEW_LOSS_SCALE if few else LOSS_SCALE) * error)
+    adjust(sharp, loss_scale=LOSS_SCALE * error)
     return sharp
 
 
