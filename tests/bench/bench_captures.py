@@ -12,6 +12,7 @@ import itertools
 import re
 import subprocess
 import sys
+import zlib  # noqa: F401  # pycolmap must not be the first to load it
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -18,6 +18,7 @@ import dataclasses
 import json
 import os
 import time
+import zlib  # noqa: F401  # pycolmap must not be the first to load it
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
