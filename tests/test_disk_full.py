@@ -37,7 +37,7 @@ background = "off"
 stereo = "off"
 checkpoint_every = 5
 """
-RESULTS = {"place": "place/sparse/points3D.bin", "train": "train/splats.ply"}
+RESULTS = {"sfm": "place/sparse/points3D.bin", "train": "train/splats.ply"}
 
 
 def recon(*words: object, largest: int | None = None) -> subprocess.CompletedProcess[str]:

@@ -30,7 +30,7 @@ densify_every = 10
 checkpoint_every = 5
 """
 STAGES = ("ingest", "denoise", "sfm", "place", "train", "prune", "evaluate", "export")
-VERBS = {"evaluate": "eval"}
+VERBS = {"evaluate": "eval", "place": "sfm"}
 EVERY_LINE = """
 import json, sys
 from recon_cli.cli import main

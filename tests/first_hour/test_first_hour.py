@@ -78,7 +78,7 @@ def test_what_is_named_next_after_a_video_works(filmed):
 def test_the_same_command_again_finds_everything_done(filmed, sample_video):
     folder, _ = filmed
     printed = recon(folder, "run", sample_video, *FRAMES, "--title", "Our room", *SMALL)
-    assert printed.count("is up to date") == 8  # the stages, and the page
+    assert printed.count("is up to date") == 9  # the stages, and the page
 
 
 def test_a_time_for_the_whole_run_is_a_choice_that_is_kept(tmp_path, sample_video, monkeypatch):

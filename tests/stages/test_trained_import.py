@@ -129,7 +129,7 @@ def test_a_scene_that_was_not_compared_with_the_views_as_they_are_is_refused(
     views = tmp_path / "later"
     views.mkdir()
     assert recon("import", views, scene, "--max-size", "48") == 0
-    for name in ("ingest", "denoise", "sfm"):
+    for name in ("ingest", "denoise", "sfm", "place"):
         shutil.copytree(workspace / name, views / name)
     assert recon("train", views, *FURTHER) == 4
     assert "has not been compared with the views" in capsys.readouterr().err
