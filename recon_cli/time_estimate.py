@@ -37,6 +37,10 @@ class Cost:
         """Returns the CPU seconds of a piece of this size."""
         return self.fixed + self.each * size
 
+    def times(self, fixed: float, each: float) -> Cost:
+        """Returns the cost of which both parts are so many times as high."""
+        return Cost(self.fixed * fixed, self.each * each)
+
 
 # On a CPU with AVX2. Of walks: fitted to nine (tests/bench/notes/cameras.md). Of photos: those of
 # a CPU with AVX-512, which takes 1.6 times less; no set of photos has been timed on this one.
