@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.scores import Metrics, ViewScore
-from recon_cli.io.images import fit_image, fit_size, read_png
+from recon_cli.io.images import encode_image, fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
 
 MAX_FILE_BYTES = 15_000_000
@@ -214,12 +214,13 @@ def read_picture(path: Path, encoding: Encoding = THUMB) -> Markup:
 
 
 def data_uri(image: NDArray[np.uint8], quality: int) -> Markup:
-    """Returns RGB pixels [H, W, 3] as a data URI of WebP, in which nothing needs escaping."""
-    encoded, data = cv2.imencode(
-        ".webp", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_WEBP_QUALITY, quality])
-    if not encoded:
-        raise ValueError(f"OpenCV cannot encode an image of shape {image.shape}")
-    return Markup("data:image/webp;base64," + base64.b64encode(data.tobytes()).decode())
+    """Returns RGB pixels [H, W, 3] as a data URI of WebP."""
+    return embed(encode_image(image, "webp", cv2.IMWRITE_WEBP_QUALITY, quality), "webp")
+
+
+def embed(picture: bytes, kind: str) -> Markup:
+    """Returns the file of a picture as a data URI, in which nothing needs escaping."""
+    return Markup(f"data:image/{kind};base64,{base64.b64encode(picture).decode()}")
 
 
 def encode_sheet(image: NDArray[np.uint8]) -> Markup:
