@@ -15,6 +15,7 @@ from typing import Protocol
 
 from tqdm import tqdm
 
+RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
 LINE_SECONDS = 20.0  # between two lines of a stage
 
 logger = logging.getLogger("recon.progress")
@@ -188,6 +189,19 @@ class TqdmProgress:
             mininterval=0.2, dynamic_ncols=True, bar_format=_PERCENT if unit == "%" else None,
         ) as bar:
             yield _TqdmBar(bar)
+
+
+def limit_rate(record: Callable[[int, int], None]) -> Callable[[int, int], None]:
+    """Returns a function that records what is done, of a total, at most twice a second."""
+    last = float("-inf")
+
+    def limited(done: int, total: int) -> None:
+        nonlocal last
+        if done == total or time.monotonic() - last >= RECORD_SECONDS:
+            last = time.monotonic()
+            record(done, total)
+
+    return limited
 
 
 def format_duration(seconds: float) -> str:

@@ -13,7 +13,8 @@ from recon_cli.stages import STAGES
 MAX_LINES = 500
 
 # Each part of the package (a module or folder at its top) and the parts that it may import.
-BASE = {"deadline", "errors", "plugins", "progress", "machine", "processes", "signals"}
+BASE = {"deadline", "errors", "plugins", "progress", "machine", "processes", "signals",
+        "time_estimate"}
 RECORDS = BASE | {"workspace", "config", "scene"}
 READ = RECORDS | {"io"}
 DRAW = READ | {"context", "kernels", "render", "evaluation", "stereo", "splats"}
@@ -25,6 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "plugins": set(),
     "processes": set(),
     "signals": {"errors"},
+    "time_estimate": set(),
     "progress": {"errors"},
     "cgroups": set(),
     "machine": {"cgroups", "errors"},

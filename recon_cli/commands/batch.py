@@ -9,15 +9,15 @@ import click
 
 from recon_cli.commands import options
 from recon_cli.commands.console import say
-from recon_cli.commands.jobs import open_executor
 from recon_cli.commands.options import Call, pass_call, verb
 from recon_cli.config import settings
 from recon_cli.config.stages import ComputeConfig
-from recon_cli.errors import ReconstructionError, WorkspaceError
+from recon_cli.errors import ReconstructionError
+from recon_cli.jobs.executor import NEEDS_GPU, start_executor
 from recon_cli.jobs.shared_jobs import describe_failures
 from recon_cli.pipeline.batch import CaptureResult, name_captures, run_batch
 from recon_cli.progress import TqdmProgress, format_duration, hide_bars
-from recon_cli.workspace.layout import disk_errors, hold_lock
+from recon_cli.workspace.layout import hold_lock, make_folder
 
 
 def _check_assignments(
@@ -34,9 +34,7 @@ def _check_assignments(
     "--out", required=True, type=options.PathType(file_okay=False), metavar="DIR",
     help="Folder of the workspaces, of batch.json and batch.html.")
 @options.executor("Captures")
-@click.option(
-    "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
-    help="Also prune midway through training.  [default: on]")
+@options.with_prune
 @click.option(
     "--set", "assignments", multiple=True, metavar="SECTION.FIELD=VALUE",
     callback=_check_assignments,
@@ -66,14 +64,11 @@ def batch(
     words += [] if compute.max_memory is None else ["--max-memory", str(compute.max_memory)]
     words += ["--again"] * call.again + ["-v"] * call.verbose
     captures = name_captures(inputs, out)
-    try:
-        with disk_errors(out, "making it"):
-            out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WorkspaceError(f"{out} cannot be made: {error.strerror}.",
-                             hint="Give another folder with --out.") from error
+    make_folder(out)
     with hold_lock(out, "batch", other="another folder with --out"):
-        executor, threads = open_executor(place, jobs, compute, out, inputs)
+        executor, threads = start_executor(
+            place, out, inputs=inputs, slots=jobs, cores=compute.threads,
+            gpu=NEEDS_GPU[compute.device])
         try:
             results = run_batch(
                 captures, out, [*words, "--threads", str(threads)], executor, TqdmProgress(),

@@ -21,20 +21,18 @@ from recon_cli.config.settings import Settings, build, merge
 from recon_cli.config.stages import IngestConfig, TrainConfig
 from recon_cli.deadline import Clock, Deadline
 from recon_cli.errors import ReconError, name_command
-from recon_cli.sfm.mapping.time_estimate import Workload, expected_seconds, measure_slowness
+from recon_cli.time_estimate import Cost, TimeEstimator, Work, list_mapping, measure_machine
 from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.summaries import IngestSummary, JsonRecord, TrainSummary
 
 FILE = "budget.json"
 LEAST_FRAMES = 24
-_INGEST = 0.1  # seconds of one core to read a picture of a video, a megapixel
 _SFM = 0.4  # of the time that is left after ingest beside scores, at most
 _PRUNE = 0.45  # of the seconds of training, set aside
 _LATE = 1.15  # of the minutes, from which the user is told
-# seconds of evaluate, export and report, on the machine of sfm.time_estimate: rooms took 10 to 13
-_SCORES = 15.0
-_LEAST_TRAINING, _LEAST_PRUNING = 12.0, 12.0  # seconds, likewise; the demo is pruned in 13
+# seconds on the machine of `COSTS`; the demo is pruned in 13
+_LEAST_TRAINING, _LEAST_PRUNING = 12.0, 12.0
 
 logger = logging.getLogger("recon")
 
@@ -61,12 +59,11 @@ def run_within(
     # what contradicts a time, such as a number of steps, is refused before anything runs
     build(TrainConfig, merge([base, {"train": {"minutes": minutes}}, given]))
     budget = _recorded(call, minutes, inputs)
-    threads = open_job(call).compute.threads or machine.usable_threads()
-    slowness = measure_slowness(threads)
+    estimator = measure_machine(open_job(call).compute.threads or machine.usable_threads())
 
     def left() -> float:
         """Returns the seconds that are left beside those of evaluate, export and report."""
-        return deadline.left - _SCORES * slowness
+        return deadline.left - estimator.total([Work("scores", 1)])
 
     def stages(*names: str, **chosen: Settings) -> None:
         run_stages(call, "run", names, sources=inputs if "ingest" in names else (), base=merge(
@@ -76,7 +73,7 @@ def run_within(
         most = None
         if not {"frames", "max_frames"} & given.get("ingest", {}).keys():
             # before anything is read, as a second reading takes as long as the first
-            most = _most_frames(inputs, left(), threads, slowness)
+            most = _most_frames(inputs, left(), estimator)
         budget = Budget(
             minutes=minutes, inputs=tuple(str(path.absolute()) for path in inputs), max_frames=most)
     frames: Settings = ({} if budget.max_frames is None
@@ -84,12 +81,12 @@ def run_within(
     stages("ingest", frames=frames)
     write_json(workspace.root / FILE, budget.to_json())  # now that there is a folder
     call.deadline = Deadline(_SFM * left(), clock)
-    _report_frames(workspace, budget, call.deadline.seconds, threads, slowness)
+    _report_frames(workspace, budget, call.deadline.seconds, estimator)
     stages("denoise", "sfm", "place", frames=frames)
     if budget.train_minutes is None:
         pruning = left() * _PRUNE / (1 + _PRUNE)
-        prune = with_prune and pruning >= _LEAST_PRUNING * slowness
-        seconds = max(left() - pruning * prune, _LEAST_TRAINING * slowness)
+        prune = with_prune and pruning >= _LEAST_PRUNING * estimator.slowness
+        seconds = max(left() - pruning * prune, _LEAST_TRAINING * estimator.slowness)
         budget = dataclasses.replace(
             budget, train_minutes=round(seconds / 60, 2), prune=None if prune else False)
         write_json(workspace.root / FILE, budget.to_json())
@@ -121,7 +118,7 @@ def _recorded(call: Call, minutes: float, inputs: tuple[Path, ...]) -> Budget | 
 
 
 def _most_frames(
-    inputs: tuple[Path, ...], left: float, threads: int, slowness: float
+    inputs: tuple[Path, ...], left: float, estimator: TimeEstimator
 ) -> int | None:
     """Returns how many frames of videos have cameras in time; None where the inputs are no videos.
     """
@@ -137,18 +134,17 @@ def _most_frames(
     except ReconError:  # ingest says what they are, or what is wrong with them
         return None
     longest = IngestConfig().max_size ** 2 * 9 / 16 / 1e6  # megapixels of a stored frame
-    reading = _INGEST * pictures * megapixels * slowness / threads
-    seconds = _SFM * (left - reading)
+    seconds = _SFM * (
+        left - estimator.total([Work("picture", pictures, megapixels, shared=True)]))
     frames = IngestConfig().max_frames
-    while frames > LEAST_FRAMES and expected_seconds(
-            Workload(frames, min(megapixels, longest), tracked=True), threads,
-            slowness=slowness) > seconds:
+    while frames > LEAST_FRAMES and estimator.total(
+            list_mapping(frames, min(megapixels, longest), tracked=True)) > seconds:
         frames = max(LEAST_FRAMES, int(0.95 * frames))
     return frames
 
 
 def _report_frames(
-    workspace: Workspace, budget: Budget, seconds: float, threads: int, slowness: float
+    workspace: Workspace, budget: Budget, seconds: float, estimator: TimeEstimator
 ) -> None:
     """Says that fewer frames are used than without a budget, or that more are than it has time for.
     """
@@ -158,9 +154,9 @@ def _report_frames(
     if ingested.frames == budget.max_frames:
         logger.warning("no more than %d frames are used, so that the run ends within --minutes; "
                        "--frames keeps more", ingested.frames)
-    expected = expected_seconds(
-        Workload(ingested.frames, ingested.width * ingested.height / 1e6,
-                 ingested.kind == "video"), threads, slowness=slowness)
+    expected = estimator.total(list_mapping(
+        ingested.frames, ingested.width * ingested.height / 1e6,
+        tracked=ingested.kind == "video"))
     if ingested.kind != "video" and ingested.metric is None and expected > 2 * seconds:
         logger.warning("the cameras of %d photos take about %.1f of the %g minutes: fewer photos "
                        "leave more for training", ingested.frames, expected / 60, budget.minutes)
@@ -175,5 +171,6 @@ def _pruning_seconds(workspace: Workspace) -> float:
     assert manifest is not None
     training = TrainSummary.from_json(manifest.run.summary)
     steps = count_recovery_steps(training.planned_iterations, training.training_views)
-    step = training.train_seconds / max(1, training.iterations)
-    return manifest.run.seconds - training.train_seconds + steps * step
+    return Cost(
+        manifest.run.seconds - training.train_seconds,
+        training.train_seconds / max(1, training.iterations)).seconds(steps)

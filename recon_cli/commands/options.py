@@ -185,6 +185,9 @@ def _switch(flag: str, help: str, *short: str, expert: bool = False) -> Decorato
 
 verbosity = _switch("--verbose", "Show details and tracebacks.", "-v")
 again = _switch("--again", "Run anew, even if up to date.")
+with_prune = click.option(
+    "--prune/--no-prune", "with_prune", cls=Option, default=True,
+    help="Also prune midway through training.  [default: on]")
 from_import = _switch("--from-import", "Train the imported scene further.")
 print_config = _switch("--print-config", "Print options as TOML and exit.", expert=True)
 

@@ -1,14 +1,22 @@
-"""One sentence about the result of each stage, for `recon status` and the end of a stage."""
+"""What is said of results: a sentence about each stage, and the end of a run.
+
+The end says what was made, where it lies, how good it is, and what to type next.
+"""
 
 from __future__ import annotations
 
+import logging
+import webbrowser
 from collections.abc import Mapping, Sequence
 from functools import singledispatch
 from typing import Any
 
+from recon_cli.commands.console import say
 from recon_cli.config.stages import MODEL_LABELS
-from recon_cli.errors import ManifestError, format_count
-from recon_cli.progress import format_megabytes
+from recon_cli.errors import ManifestError, command_line, format_count
+from recon_cli.pipeline.execute import Job, Outcome
+from recon_cli.pipeline.plan import check_parts
+from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.stages import IMPORT
 from recon_cli.stages import stage as stage_row
 from recon_cli.workspace.summaries import (
@@ -24,6 +32,53 @@ from recon_cli.workspace.summaries import (
     SfmSummary,
     TrainSummary,
 )
+
+logger = logging.getLogger("recon")
+
+
+def report_outcome(outcome: Outcome) -> None:
+    """Prints one line about a stage: its result, or that it is up to date."""
+    run = outcome.manifest.run
+    known = {"outcome": outcome, "event": "done", "stage": outcome.stage, "seconds": run.seconds}
+    if outcome.ran:
+        sentence = describe_summary(outcome.stage, run.summary)
+        logger.info("%s (%s)", ": ".join(filter(None, [outcome.stage, sentence])),
+                    format_duration(run.seconds), extra=known)
+        return
+    logger.info("%s is up to date", outcome.stage, extra=known)
+    for notice in run.summary.get("notices") or ():
+        logger.warning("%s", notice)
+
+
+def end_run(job: Job, *, open_page: bool = False) -> None:
+    """Writes the report, and prints the results of a run that is complete."""
+    from recon_cli.report.build import FILE, write_report
+    from recon_cli.trust.quality import read_quality
+    from recon_cli.workspace.records import name_photos, read_frame_list  # imports numpy
+
+    workspace = job.workspace
+    folder, ingest = workspace.folder("export"), workspace.folder("ingest")
+    manifest, place = workspace.manifest("export"), workspace.manifest("place")
+    assert manifest is not None, "the run has exported"
+    page = next((folder / check.manifest.run.summary["file"]
+                 for check in check_parts(job, "export")
+                 if check.row.part == "html" and check.manifest and check.fresh), None)
+    scene = folder / ExportSummary.from_json(manifest.run.summary).file
+    write_report(job, None)
+    quality = read_quality(
+        workspace.folder("evaluate"), PlaceSummary.from_json(place.run.summary) if place else None,
+        read_frame_list(ingest).frames)
+    say("")
+    for name, path in (("scene", scene), ("page", page), (
+            "report", workspace.root / FILE)):
+        if path is not None:
+            say(f"{name + ':':9}{path} ({format_megabytes(path.stat().st_size)})")
+    say(f"quality: {name_photos(ingest)(str(quality))}")
+    say("next:    " + (command_line("view") if page is None else (
+        f"open {page.name} in a browser or send it; "
+        f"{command_line('render --tour --out walk.mp4')}")))
+    if open_page:
+        webbrowser.open((page or workspace.root / FILE).resolve().as_uri())
 
 
 def describe_summary(stage: str, summary: Mapping[str, Any]) -> str:

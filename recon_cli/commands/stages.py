@@ -10,8 +10,9 @@ import click
 
 from recon_cli.commands import options
 from recon_cli.commands.console import say
-from recon_cli.commands.jobs import end_run, open_job_with, run_stages
+from recon_cli.commands.jobs import open_job, open_job_with, run_stages
 from recon_cli.commands.options import Call, explicit_settings, pass_call, verb
+from recon_cli.commands.sentences import end_run
 from recon_cli.commands.view import show_training
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.settings import Settings
@@ -169,9 +170,7 @@ def export(call: Call) -> None:
 
 @verb("run")
 @_inputs
-@click.option(
-    "--prune/--no-prune", "with_prune", cls=options.Option, default=True,
-    help="Also prune midway through training.  [default: on]")
+@options.with_prune
 @click.option(
     "--minutes", type=click.FloatRange(min=0.1), metavar="X",
     help="Time for the whole run; frames, steps and pruning are chosen for it.  "
@@ -204,7 +203,7 @@ def run(
     else:
         run_stages(call, "run", stages, sources=inputs, base=_with_page(MID, call))
     if not call.print_config:
-        end_run(call, open_page=with_open)
+        end_run(open_job(call), open_page=with_open)
 
 
 @verb("demo")
@@ -217,7 +216,7 @@ def demo(call: Call) -> None:
     """Run every stage on the bundled room video."""
     stages = [row.name for row in STAGES]
     run_stages(call, "demo", stages, sources=(SAMPLE,), base=_with_page(DEMO, call))
-    end_run(call)
+    end_run(open_job(call))
 
 
 def _with_page(base: Settings, call: Call) -> Settings:

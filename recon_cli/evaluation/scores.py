@@ -260,13 +260,14 @@ def model_table(
 
 
 def view_table(models: Mapping[str, ModelMetrics]) -> Table:
-    """Returns each view with the scores of all models, which have the same views."""
-    headings = ("view", *(
-        f"{metric} {label}" for metric in ("PSNR dB", "SSIM") for label in models))
-    return Table(headings, tuple((
-        views[0].name, *(f"{view.psnr_db:.2f}" for view in views),
-        *(f"{view.ssim:.4f}" for view in views))
-        for views in zip(*(model.views for model in models.values()), strict=True)))
+    """Returns each view of the first model with the scores of all models, "-" where one lacks it.
+    """
+    scores = {"PSNR dB": ("psnr_db", ".2f"), "SSIM": ("ssim", ".4f")}
+    by_name = [{view.name: view for view in model.views} for model in models.values()]
+    return Table(("view", *(f"{score} {label}" for score in scores for label in models)), tuple((
+        name, *(or_dash(getattr(views.get(name), key, None), form)
+                for key, form in scores.values() for views in by_name))
+        for name in by_name[0]))
 
 
 def paper_table(

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.errors import WorkspaceError
 from recon_cli.evaluation.intervals import Interval, Spread, paired_t
 from recon_cli.evaluation.metrics import PSNR_CONVENTION, SSIM_CONVENTION
 from recon_cli.evaluation.scores import Table, or_dash
@@ -51,7 +50,7 @@ from recon_cli.experiments.variants import (
 from recon_cli.progress import Progress
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.layout import disk_errors, hold_lock
+from recon_cli.workspace.layout import disk_errors, hold_lock, make_folder
 from recon_cli.workspace.steps import StepFolder
 
 # The paper compares the first two; the others are `recon train` without and with --prune.
@@ -179,12 +178,7 @@ class StudyResult:
 def run(request: StudyRequest, progress: Progress) -> Result:
     """Makes the missing runs, writes the files, and returns the result."""
     paths, out = check_scenes(request.scenes), request.out
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WorkspaceError(
-            f"The folder {out} cannot be created: {error.strerror}.",
-            hint="Give another folder with --out.") from error
+    make_folder(out)
     with (disk_errors(out, "running study"),
           hold_lock(out, "study", other="another folder with --out")):
         records = open_records(out)

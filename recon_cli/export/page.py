@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from recon_cli.context import StageContext
 from recon_cli.evaluation.reference_views import render_view
-from recon_cli.io.images import to_uint8
+from recon_cli.io.images import encode_image, to_uint8
 from recon_cli.io.views import evenly_spread
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
@@ -95,9 +95,7 @@ def draw_poster(splats: Splats, tour: Tour, ctx: StageContext) -> bytes:
     view = Camera(width, height, camera.fx / fit, camera.fy / fit, width / 2 + middle_x / fit,
                   height / 2 + middle_y / fit, camera.viewmat)
     rgb = to_uint8(render_view(splats, view, splats.sh_degree, ctx.backend).rgb.cpu().numpy())
-    _, data = cv2.imencode(
-        ".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _POSTER_QUALITY])
-    return bytes(data)
+    return encode_image(rgb, "jpg", cv2.IMWRITE_JPEG_QUALITY, _POSTER_QUALITY)
 
 
 def _small(camera: Camera) -> Camera:

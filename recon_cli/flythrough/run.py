@@ -220,28 +220,19 @@ def _make_folders(request: RenderRequest, plan: CameraPlan, workspace: Path) -> 
     folder = workspace / layout.RENDERS / f"{plan.name}-{'-'.join(request.outputs)}"
     if request.out is not None and request.out_file is None:
         folder = request.out.absolute()
-    _make_folder(folder)
+    layout.make_folder(folder)
     others = {path.name for path in folder.iterdir() if not path.match(LEFTOVERS)} - {LOCK, HOLDER}
     if others and RECORD not in others:
         raise WorkspaceError(
             f"{folder} is not empty: it holds {min(others)}, but no {RECORD}, so recon did not "
             "create it.", hint="Give a new or an empty folder with --out.")
     if request.out_file is not None:
-        _make_folder(request.out_file.absolute().parent)
+        layout.make_folder(request.out_file.absolute().parent)
         if request.out_file.is_dir():
             raise WorkspaceError(
                 f"{request.out_file} is a folder, but a file is to be written there.",
                 hint="Give another file with --out.")
     return folder
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WorkspaceError(
-            f"The folder {folder} cannot be created: {error.strerror}.",
-            hint="Give another one with --out.") from error
 
 
 def _frame_settings(

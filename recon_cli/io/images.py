@@ -101,9 +101,15 @@ def to_uint8(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def encode_image(image: NDArray[np.uint8], kind: str) -> bytes:
-    """Returns an image [H, W, 3] as a file of a kind: png, or jpg of quality 95."""
-    encoded, data = cv2.imencode(f".{kind}", np.ascontiguousarray(image[:, :, ::-1]))
+def encode_image(
+    image: NDArray[np.uint8] | NDArray[np.uint16], kind: str, *parameters: int
+) -> bytes:
+    """Returns [H, W, 3] RGB or [H, W] gray as a file of a kind: png, webp, or jpg of quality 95.
+
+    `parameters` are those of OpenCV's imencode.
+    """
+    ordered = image[:, :, ::-1] if image.ndim == 3 else image
+    encoded, data = cv2.imencode(f".{kind}", np.ascontiguousarray(ordered), parameters)
     if not encoded:
         raise ValueError(f"OpenCV cannot encode an image of shape {image.shape} as {kind}")
     return data.tobytes()
@@ -111,11 +117,7 @@ def encode_image(image: NDArray[np.uint8], kind: str) -> bytes:
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Writes [H, W, 3] RGB or [H, W] gray of 8 or 16 bits as PNG, atomically."""
-    ordered = image[:, :, ::-1] if image.ndim == 3 else image
-    encoded, data = cv2.imencode(".png", np.ascontiguousarray(ordered))
-    if not encoded:
-        raise ValueError(f"OpenCV cannot encode an image of shape {image.shape}")
-    write_bytes(path, data.tobytes())
+    write_bytes(path, encode_image(image, "png"))
 
 
 def is_whole_png(path: Path) -> bool:

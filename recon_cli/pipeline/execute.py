@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import threading
-import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -23,15 +22,13 @@ from recon_cli.deadline import Deadline
 from recon_cli.errors import ConfigError, InputError, ManifestError, ReconError, name_command
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
-from recon_cli.progress import NullProgress, Progress, in_stage
+from recon_cli.progress import NullProgress, Progress, in_stage, limit_rate
 from recon_cli.stages import STAGES, Stage
 from recon_cli.workspace.digests import Source, digest_file, digest_outputs, read_source
 from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import NAME as MANIFEST
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, RunRecord
 from recon_cli.workspace.summaries import JsonRecord
-
-_RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
 
 logger = logging.getLogger("recon")
 
@@ -102,7 +99,9 @@ def run_stage(
     rename = name_photos(inputs.folders["ingest"]) if "ingest" in inputs.folders else str
     with machine.Meter() as meter, in_stage(row.name), _discard_if_useless(
             workspace, row, earlier), _naming_photos(rename):
-        ctx = stage_context(job, row, _recorder(workspace, earlier, meter))
+        ctx = stage_context(job, row, limit_rate(lambda done, total: workspace.record(
+            dataclasses.replace(earlier, done=done, total=total,
+                                seconds=earlier.seconds + meter.seconds))))
         run_it = import_module(row.module).run
         with importing_ahead(job) as while_idle:
             summary: JsonRecord = run_it(
@@ -232,22 +231,6 @@ def _read_last_sources(job: Job, row: Stage) -> tuple[Source, ...]:
     return tuple(
         read_source(Path(source.path), known=source, without=job.workspace.root)
         for source in sources)
-
-
-def _recorder(
-    workspace: Workspace, earlier: PartialRun, meter: machine.Meter
-) -> Callable[[int, int], None]:
-    """Returns the function behind `StageContext.record`; it writes at most twice a second."""
-    last = float("-inf")
-
-    def record(done: int, total: int) -> None:
-        nonlocal last
-        if done == total or time.monotonic() - last >= _RECORD_SECONDS:
-            last = time.monotonic()
-            workspace.record(dataclasses.replace(
-                earlier, done=done, total=total, seconds=earlier.seconds + meter.seconds))
-
-    return record
 
 
 def stage_context(job: Job, row: Stage, record: Callable[[int, int], None]) -> StageContext:

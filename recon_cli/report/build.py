@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
-import shlex
-from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -17,39 +15,18 @@ from markupsafe import Markup, escape
 
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
-from recon_cli.evaluation.scores import Metrics
 from recon_cli.pipeline.execute import Job, last_sources
 from recon_cli.progress import format_duration, format_megabytes
-from recon_cli.report.capture import read_capture
-from recon_cli.report.curves import draw_rounds, draw_training_curves
-from recon_cli.report.gallery import (
-    GAIN,
-    MAX_FILE_BYTES,
-    MOST_ERROR,
-    Gallery,
-    GalleryView,
-    build_gallery,
-    legend_stops,
-)
+from recon_cli.report.gallery import MAX_FILE_BYTES, Gallery, GalleryView, build_gallery
 from recon_cli.report.headline import build_headline, format_facts
-from recon_cli.report.moving_section import read_moving
 from recon_cli.report.opening import build_opening
-from recon_cli.report.parts import read_parts
-from recon_cli.report.records import build_scores, read_metrics
-from recon_cli.report.room import read_room
-from recon_cli.report.stage_status import (
-    StageReports,
-    inspect_stages,
-    read_decisions,
-    read_provenance,
-)
-from recon_cli.report.trust_section import read_trust
+from recon_cli.report.records import read_metrics
+from recon_cli.report.sections import SECTIONS
+from recon_cli.report.stage_status import inspect_stages
 from recon_cli.splats.html import ICON
-from recon_cli.trust.quality import delivered_model
 from recon_cli.workspace import atomic
 from recon_cli.workspace.layout import disk_errors
 from recon_cli.workspace.records import name_photos
-from recon_cli.workspace.summaries import ExportSummary
 
 FILE = "report.html"
 _SUFFIXES = (".html", ".htm")
@@ -112,7 +89,14 @@ def build_report(job: Job, folder: Path) -> bytes:
             metrics = read_metrics(stages["evaluate"].folder)
         except FormatError as error:
             damaged = f"The scores are not shown: {error.message}"
-    values = _template_values(job, stages, metrics, damaged, folder)
+    opening = build_opening(stages, metrics, folder)
+    values = {
+        "stages": stages, "opening": opening, "damaged": damaged, "labels": MODEL_LABELS,
+        "icon": ICON, "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"),
+        "headline": build_headline(stages, metrics, opening.trust),
+        "sections": SECTIONS}
+    for section in SECTIONS:
+        values.update(section.gather(stages, metrics))
     rename = name_photos(stages["ingest"].folder)
     rename_marked = name_photos(stages["ingest"].folder, shown=lambda name: str(escape(name)))
 
@@ -123,9 +107,16 @@ def build_report(job: Job, folder: Path) -> bytes:
 
     environment = _environment().overlay(finalize=name_in)
 
+    script = (_HERE / "script.js").read_text(encoding="utf-8")
+    # the hash in the content policy lets the browser run this script and no other
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
     def render(gallery: Gallery) -> bytes:
-        data = [_script_data(view, rename(view.name)) for view in gallery.views]
-        return _render_page(environment, values, gallery, data)
+        page = render_template(
+            "report.html.j2", environment, **values, gallery=gallery, script=Markup(script),
+            script_hash=digest,
+            data=[_script_data(view, rename(view.name)) for view in gallery.views])
+        return page.encode(errors="backslashreplace")  # file names need not be UTF-8
 
     views = sum(len(model.views) for model in metrics.models.values()) if metrics else 0
     if not views or metrics is None:
@@ -136,33 +127,6 @@ def build_report(job: Job, folder: Path) -> bytes:
         stages["evaluate"].folder, metrics, MAX_FILE_BYTES - text, job.progress))
 
 
-def _template_values(
-    job: Job, stages: StageReports, metrics: Metrics | None, damaged: str, folder: Path
-) -> dict[str, Any]:
-    """Returns the template's values, except for the views."""
-    root, opening = job.workspace.root, build_opening(stages, metrics, folder)
-    runs = [stage.manifest.run for stage in stages.values() if stage.manifest]
-    return {
-        "stages": stages, "opening": opening,
-        "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"),
-        "headline": build_headline(stages, metrics, opening.trust), "capture": read_capture(stages),
-        "parts": read_parts(stages),
-        "trust": read_trust(stages),
-        "curves": draw_training_curves(stages, metrics),
-        "moving": read_moving(stages),
-        "decisions": read_decisions(stages["train"]), "damaged": damaged,
-        "delivered": delivered_model(metrics),
-        "scores": build_scores(metrics) if metrics and metrics.models else None,
-        "rounds": draw_rounds(stages["prune"]),
-        "part_command": f"recon sfm -w {shlex.quote(str(root))} --part",
-        "provenance": read_provenance(stages), "labels": MODEL_LABELS,
-        "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),
-        "longest": max(run.seconds for run in runs),
-        "largest": max(run.peak_memory_bytes for run in runs),
-        "icon": ICON, "gain": GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),
-    }
-
-
 @cache
 def _environment() -> Environment:
     environment = Environment(
@@ -171,18 +135,6 @@ def _environment() -> Environment:
     environment.filters.update(
         duration=format_duration, megabytes=format_megabytes, facts=format_facts)
     return environment
-
-
-def _render_page(
-    environment: Environment, values: Mapping[str, Any], gallery: Gallery,
-    data: Sequence[Mapping[str, Any]],
-) -> bytes:
-    script = (_HERE / "script.js").read_text(encoding="utf-8")
-    # the hash in the content policy lets the browser run this script and no other
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    page = render_template("report.html.j2", environment, **values, gallery=gallery, data=data,
-                           script=Markup(script), script_hash=digest)
-    return page.encode(errors="backslashreplace")  # file names need not be UTF-8
 
 
 def render_template(name: str, environment: Environment | None = None, /, **values: Any) -> str:

@@ -6,7 +6,6 @@ mark with a line in its viewing direction.
 
 from __future__ import annotations
 
-import base64
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from recon_cli.io.colmap import read_scene
 from recon_cli.io.images import read_png
 from recon_cli.io.svg import PlanLayout, element, label
 from recon_cli.report.chart import TICK_STEPS, draw_legend, draw_mark
-from recon_cli.report.gallery import encode_sheet, note_damage, read_picture
+from recon_cli.report.gallery import embed, encode_sheet, note_damage, read_picture
 from recon_cli.report.stage_status import StageReports
 from recon_cli.report.trust_section import read_regions
 from recon_cli.scene.gravity import find_gravity, mean_up
@@ -249,7 +248,7 @@ def _draw_density(points: NDArray[np.float64], layout: PlanLayout) -> Markup:
     picture[..., 3] = np.rint(230 * opacity)
     _, data = cv2.imencode(".png", picture)
     return element("image", width=columns * _CELL, height=rows * _CELL,
-                   href=f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}")
+                   href=embed(data.tobytes(), "png"))
 
 
 def _draw_camera(view: View, axes: PlanAxes, layout: PlanLayout, part: str, size: float) -> Markup:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -18,12 +19,10 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.scores import Metrics, ViewScore
-from recon_cli.io.images import fit_image, fit_size, read_png
+from recon_cli.io.images import encode_image, fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
 
 MAX_FILE_BYTES = 15_000_000
-GAIN = 4  # of a difference, as in evaluate/difference
-MOST_ERROR = 256 // GAIN  # mean error in 1/255 from which on colours no longer change
 _HIDDEN = (96, 96, 96)  # of masked pixels in a difference: no colour of the map
 
 
@@ -77,6 +76,15 @@ class Gallery:
     encoding: Encoding | None = None  # None without views
     left_out: int = 0  # views for which there was no room
     damaged: tuple[str, ...] = ()  # why views are missing, a sentence each
+    # of differences, as in evaluate/difference
+    gain: ClassVar[int] = 4
+    most_error: ClassVar[int] = 256 // gain  # in 1/255; beyond, colours no longer change
+
+    @property
+    def stops(self) -> list[str]:
+        """CSS colours of differences from none to the most, evenly spread."""
+        levels = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
+        return [f"rgb({r},{g},{b})" for r, g, b in apply_colormap(levels)[0]]
 
     @property
     def scaled(self) -> bool:
@@ -206,12 +214,13 @@ def read_picture(path: Path, encoding: Encoding = THUMB) -> Markup:
 
 
 def data_uri(image: NDArray[np.uint8], quality: int) -> Markup:
-    """Returns RGB pixels [H, W, 3] as a data URI of WebP, in which nothing needs escaping."""
-    encoded, data = cv2.imencode(
-        ".webp", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_WEBP_QUALITY, quality])
-    if not encoded:
-        raise ValueError(f"OpenCV cannot encode an image of shape {image.shape}")
-    return Markup("data:image/webp;base64," + base64.b64encode(data.tobytes()).decode())
+    """Returns RGB pixels [H, W, 3] as a data URI of WebP."""
+    return embed(encode_image(image, "webp", cv2.IMWRITE_WEBP_QUALITY, quality), "webp")
+
+
+def embed(picture: bytes, kind: str) -> Markup:
+    """Returns the file of a picture as a data URI, in which nothing needs escaping."""
+    return Markup(f"data:image/{kind};base64,{base64.b64encode(picture).decode()}")
 
 
 def encode_sheet(image: NDArray[np.uint8]) -> Markup:
@@ -238,7 +247,7 @@ def draw_difference(
     size = fit_size(error.shape[1], error.shape[0], longest)
     if size != error.shape[::-1]:
         error = cv2.resize(error, size, interpolation=cv2.INTER_AREA)
-    colors = apply_colormap(np.rint(error * GAIN).clip(0, 255).astype(np.uint8))
+    colors = apply_colormap(np.rint(error * Gallery.gain).clip(0, 255).astype(np.uint8))
     if hidden is not None and hidden.any():
         small = cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         colors[small > 0.5] = _HIDDEN
@@ -248,9 +257,3 @@ def draw_difference(
 def apply_colormap(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Returns levels [H, W] as RGB from black over red to a pale yellow (matplotlib's inferno)."""
     return np.ascontiguousarray(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)[..., ::-1])
-
-
-def legend_stops(count: int = 9) -> Sequence[str]:
-    """Returns the colours of a difference from none to the most, as CSS writes them."""
-    levels = np.linspace(0, 255, count).round().astype(np.uint8)[None]
-    return [f"rgb({r},{g},{b})" for r, g, b in apply_colormap(levels)[0]]

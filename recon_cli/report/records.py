@@ -9,14 +9,20 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.intervals import Interval
-from recon_cli.evaluation.scores import Metrics, ModelMetrics, Table, or_dash
-from recon_cli.progress import format_megabytes
+from recon_cli.evaluation.scores import (
+    Metrics,
+    ModelMetrics,
+    Table,
+    model_table,
+    or_dash,
+    view_table,
+)
 from recon_cli.workspace.summaries import LogRow
 
 BASE, PRUNED = MODELS = ("base", "pruned")
@@ -61,8 +67,10 @@ class ScoreTables:
     notes: tuple[str, ...]  # which held-out views are not scored, a sentence each
 
 
-def build_scores(metrics: Metrics) -> ScoreTables:
-    """Returns the tables of the scores of evaluate."""
+def build_scores(metrics: Metrics | None) -> ScoreTables | None:
+    """Returns the tables of the scores of evaluate; None where no model was scored."""
+    if metrics is None or not metrics.models:
+        return None
     models = {key: metrics.models[key] for key in MODELS if key in metrics.models}
     notes = [f"{metrics.coverage[0].upper()}{metrics.coverage[1:]}."] if metrics.coverage else []
     if metrics.unregistered_test:
@@ -74,35 +82,23 @@ def build_scores(metrics: Metrics) -> ScoreTables:
     notes += [f"{MODEL_LABELS[key].capitalize()}: {moving}." for key, model in models.items()
               if (moving := metrics.describe_moving(model))]
     conventions = {title: getattr(metrics, f"{key}_convention") for key, title in _TITLES.items()}
+    by_label = {MODEL_LABELS[key]: model for key, model in models.items()}
+    views = view_table(by_label)
     return ScoreTables(
-        _model_table(models), _gap_table(models),
+        model_table(by_label), _gap_table(by_label),
         _difference_table(metrics.pruned_minus_base) if metrics.pruned_minus_base else None,
-        _view_table(models), tuple((title, text) for title, text in conventions.items() if text),
-        tuple(notes))
-
-
-def _model_table(models: Mapping[str, ModelMetrics]) -> Table:
-    perceptual = any(model.lpips is not None for model in models.values())
-    gains = any(model.gain_psnr_db is not None for model in models.values())
-    return Table(
-        ("model", "PSNR, dB", "8-bit, dB", *["PSNR after gains, dB"] * gains, "SSIM", "SSIM 0-pad",
-         *["LPIPS"] * perceptual, "Gaussians", "size", "ms a view", "training, s"),
-        tuple((
-            MODEL_LABELS[key], f"{model.psnr_db:.2f}", f"{model.psnr_8bit_db:.2f}",
-            *[or_dash(model.gain_psnr_db, ".2f")] * gains, f"{model.ssim:.4f}",
-            f"{model.ssim_padded:.4f}", *[or_dash(model.lpips, ".4f")] * perceptual,
-            f"{model.gaussians:,}", format_megabytes(model.bytes), f"{model.render_ms:.0f}",
-            or_dash(model.train_seconds, ".0f")) for key, model in models.items()))
+        replace(views, rows=sorted(views.rows, key=lambda row: float(row[1]))),
+        tuple((title, text) for title, text in conventions.items() if text), tuple(notes))
 
 
 def _gap_table(models: Mapping[str, ModelMetrics]) -> Table:
     """Returns PSNR by split; the last column shows how far the model overfits."""
     rows = []
-    for key, model in models.items():
+    for label, model in models.items():
         held_out = model.gap_psnr_db
         training, validation = map(model.seen_psnr_db.get, ("training", "validation"))
         gap = None if training is None else training - held_out
-        rows.append((MODEL_LABELS[key], or_dash(training, ".2f"), or_dash(validation, ".2f"),
+        rows.append((label, or_dash(training, ".2f"), or_dash(validation, ".2f"),
                      f"{held_out:.2f}", or_dash(gap, "+.2f")))
     return Table(("model", "training, dB", "validation, dB", "held out, dB",
                   "training minus held out, dB"), rows)
@@ -118,15 +114,3 @@ def _difference_table(differences: Mapping[str, Interval]) -> Table:
             f"{low:{form}} to {high:{form}}")
         rows.append((label, f"{difference.mean:{form}}", bounds))
     return Table(("score", "mean difference", "95% interval"), rows)
-
-
-def _view_table(models: Mapping[str, ModelMetrics]) -> Table:
-    by_name = [{view.name: view for view in model.views} for model in models.values()]
-    first = next(iter(models.values()), None)
-    rows = []
-    for view in sorted(first.views if first else (), key=lambda view: view.psnr_db):
-        scores = [views.get(view.name) for views in by_name]
-        rows.append((view.name, *(or_dash(row.psnr_db if row else None, ".2f") for row in scores),
-                     *(or_dash(row.ssim if row else None, ".4f") for row in scores)))
-    return Table(("view", *(f"PSNR {MODEL_LABELS[key]}, dB" for key in models),
-                  *(f"SSIM {MODEL_LABELS[key]}" for key in models)), rows)

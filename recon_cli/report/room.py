@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass
 
 from markupsafe import Markup
 
 from recon_cli.errors import FormatError
+from recon_cli.report.gallery import embed
 from recon_cli.report.stage_status import StageReport
 from recon_cli.room.files import MEASURES
 from recon_cli.workspace.atomic import read_bytes, read_json
@@ -47,7 +47,5 @@ def read_room(export: StageReport) -> RoomSection | None:
         drawing = read_bytes(export.folder / PLAN)
     except (FormatError, OSError, KeyError, TypeError, ValueError) as error:
         return RoomSection((), (f"The measures are not shown: {error}",), None)
-    plan = None
-    if len(drawing) <= _MOST_BYTES:
-        plan = Markup("data:image/svg+xml;base64," + base64.b64encode(drawing).decode())
+    plan = embed(drawing, "svg+xml") if len(drawing) <= _MOST_BYTES else None
     return RoomSection(tuple(figures), tuple(notes), plan)

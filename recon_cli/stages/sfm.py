@@ -18,10 +18,10 @@ from recon_cli.scene.camera import MODELS, PANORAMA
 from recon_cli.sfm import database
 from recon_cli.sfm.job import CLIP_SECONDS, CameraGroup, MappingJob
 from recon_cli.sfm.mapping import process
-from recon_cli.sfm.mapping.time_estimate import Workload, estimate_for_notice, format_minutes
 from recon_cli.sfm.poses.align_world import find_places
 from recon_cli.sfm.results import MappingResult
 from recon_cli.sfm.segments import segments
+from recon_cli.time_estimate import estimate_for_notice, format_minutes, list_mapping
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import POSES, FrameList, KnownPoses, read_poses
 from recon_cli.workspace.steps import StepFolder
@@ -126,7 +126,7 @@ def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:
     mapped = segments.count_mapped(job)
     number = segments.count_segments(mapped, config.segments)
     largest = max(job.groups, key=lambda group: len(group.names))
-    seconds = estimate_for_notice(Workload(
+    seconds = estimate_for_notice(list_mapping(
         len(job.names), largest.width * largest.height / 1e6, tracked=job.tracks is not None,
         segments=number, keyframes=mapped), ctx.threads)
     if seconds is None:

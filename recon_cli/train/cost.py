@@ -1,12 +1,13 @@
-"""The expected time of a run, from a few timed steps, reports and checkpoints before it."""
+"""The costs of a training on this machine, by a few timed steps, and the work of its schedule."""
 
 from __future__ import annotations
 
 import math
 import statistics
 import time
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from recon_cli.context import TrainCallback
 from recon_cli.deadline import Clock, Deadline
 from recon_cli.scene.splats import Splats
+from recon_cli.time_estimate import Cost, TimeEstimator, Work
 from recon_cli.train.fit import densification
 from recon_cli.train.fit.initialize import splats_from_points
 from recon_cli.train.fit.loop import fit, report_every, validation_psnr
@@ -42,41 +44,29 @@ _GROWTH = 0.5  # of the count at once, as in `budget`
 _LENGTH = 1000  # steps of the run that stands for any other while steps are timed
 _SEGMENTS = 400  # into which a run is cut; more do not change the sum by .1%
 
-@dataclass(frozen=True)
-class LevelCost:
-    """Milliseconds of one step at one resolution: fixed + each x thousands of Gaussians."""
-
-    level: int  # factor by which images are reduced
-    fixed_ms: float  # for the pixels
-    each_ms: float  # for every thousand Gaussians
-
-    def ms(self, count: float) -> float:
-        """Returns the milliseconds of a step with so many Gaussians."""
-        return self.fixed_ms + self.each_ms * count / 1000
+REPORT, SAVE = "report", "save"  # a look at all validation views, and a checkpoint
 
 
-@dataclass(frozen=True)
-class CostModel:
-    """The time that the parts of a run take on this machine."""
+def step_kind(level: int) -> str:
+    """Returns the name of the cost of a step on images that are reduced by this factor."""
+    return f"step at 1/{level}"
 
-    levels: tuple[LevelCost, ...]  # of the steps, finest first
-    report: LevelCost  # of one look at all validation views
-    save_ms: float  # of one checkpoint, for every thousand Gaussians
-    seconds: float  # that the calibration took
 
-    def run_seconds(self, schedule: Schedule, first: int) -> float:
-        """Returns the seconds of all steps of a schedule that begins with `first` Gaussians."""
-        costs = {cost.level: cost for cost in self.levels}
-        config, total = schedule.config, 0.0
-        every, saves = report_every(schedule), config.checkpoint_every
-        for begin, end, count in counts(schedule, first):
-            steps = end - begin
-            total += steps * (step := costs[schedule.level((begin + end) // 2 + 1)].ms(count))
-            total += steps / every * self.report.ms(count)
-            save = self.save_ms * count / 1000
-            most = SAVE_SHARE * step if save > 1000 * LONG_SAVE else math.inf
-            total += steps * min(save / saves, most)
-        return total / 1000
+def list_work(schedule: Schedule, first: int, costs: Mapping[str, Cost]) -> Iterator[Work]:
+    """Yields the work of a schedule that begins with so many Gaussians; sizes are thousands.
+
+    How often there is time for a checkpoint follows from the costs.
+    """
+    every, saves = report_every(schedule), schedule.config.checkpoint_every
+    for begin, end, count in counts(schedule, first):
+        steps, size = end - begin, count / 1000
+        kind = step_kind(schedule.level((begin + end) // 2 + 1))
+        yield Work(kind, steps, size)
+        yield Work(REPORT, steps / every, size)
+        share, save = steps / saves, costs[SAVE].seconds(size)
+        if save > LONG_SAVE:
+            share = min(share, SAVE_SHARE * steps * costs[kind].seconds(size) / save)
+        yield Work(SAVE, share, size)
 
 
 def counts(schedule: Schedule, first: int) -> list[tuple[int, int, int]]:
@@ -102,38 +92,30 @@ def calibrate(
     scratch: Path,
     clock: Clock = time.perf_counter,
     seconds: float,
-) -> CostModel:
-    """Returns the times of the parts of a run, by a few timed steps at each level, coarsest first.
+) -> TimeEstimator:
+    """Returns the estimator of a run, by a few timed steps at each level, coarsest first.
 
-    About `seconds` are spent; after twice that, the remaining levels are told from the one before.
-    The cap of the schedule is the larger count that is timed. `scratch` is a file for a checkpoint,
-    which is deleted again.
+    About `seconds` are spent; after twice that, the costs of the remaining levels follow from the
+    one before. The cap of the schedule is the larger count that is timed. `scratch` is a file for a
+    checkpoint, which is deleted again.
     """
     deadline = Deadline(2 * seconds, clock)
     factors = {factor for _, factor in task.schedule.recipe.levels}
     wanted = sorted({1, *factors}, reverse=True)
     probe = _Probe(task, points, colors, clock, each=seconds / (2 * len(wanted)))
-    levels: list[LevelCost] = []
-    for level in wanted:
-        if levels and deadline.left <= 0:
-            levels.append(_scale_cost(levels[-1], level))
+    costs: dict[str, Cost] = {}
+    for coarser, level in pairwise([wanted[0], *wanted]):
+        if costs and deadline.left <= 0:
+            # `living`: a thousand Gaussians take .14 ms at a quarter, .32 at half
+            side = coarser / level
+            costs[step_kind(level)] = costs[step_kind(coarser)].times(side**2, side)
         else:
-            levels.append(probe.level(level))
-    report = probe.report() if deadline.left > 0 else _guess_report(levels[-1], task)
-    save_ms = probe.save_ms(scratch)
-    return CostModel(tuple(reversed(levels)), report, save_ms, deadline.spent)
-
-
-def _scale_cost(cost: LevelCost, level: int) -> LevelCost:
-    """Returns the cost of a finer level: a part grows with the pixels, the other with the side."""
-    side = cost.level / level  # `living`: .14 ms a thousand Gaussians at a quarter, .32 at half
-    return LevelCost(level, cost.fixed_ms * side**2, cost.each_ms * side)
-
-
-def _guess_report(finest: LevelCost, task: Task) -> LevelCost:
-    """Returns a third of a step for each validation view: the forward pass."""
-    share = len(task.validation) / 3
-    return LevelCost(1, finest.fixed_ms * share, finest.each_ms * share)
+            costs[step_kind(level)] = probe.step(level)
+    pass_share = len(task.validation) / 3  # of a step, for the forward pass of each view
+    costs[REPORT] = probe.report() if deadline.left > 0 else (
+        costs[step_kind(1)].times(pass_share, pass_share))
+    costs[SAVE] = probe.save(scratch)
+    return TimeEstimator(costs, seconds=deadline.spent)
 
 
 class _Enough(Exception):  # noqa: N818 - an event, not an error
@@ -178,22 +160,23 @@ class _Probe:
         views = np.linspace(0, len(task.train) - 1, _STEPS + _WARM).round().astype(int)
         self._views: list[int] = views.tolist()
 
-    def level(self, level: int) -> LevelCost:
+    def step(self, level: int) -> Cost:
         """Returns the cost of a step at a level, from those at two counts."""
         for view in set(self._views):
             self._task.pyramid.view(view, level)
-        return self._line(level, self._step_ms(self.small, level), self._step_ms(self.large, level))
+        return self._line(
+            self._step_seconds(self.small, level), self._step_seconds(self.large, level))
 
-    def _line(self, level: int, few: float, many: float) -> LevelCost:
+    def _line(self, few: float, many: float) -> Cost:
         small, large = len(self.small) / 1000, len(self.large) / 1000
         each = max(0.0, (many - few) / (large - small)) if large > small else 0.0
-        return LevelCost(level, max(0.0, few - each * small), each)
+        return Cost(max(0.0, few - each * small), each)
 
     def _state(self, splats: Splats) -> TrainState:
         task = self._task
         return new_state(splats, task.schedule.config, task.means_unit, backend=task.backend)
 
-    def _step_ms(self, splats: Splats, level: int) -> float:
+    def _step_seconds(self, splats: Splats, level: int) -> float:
         """Returns the mean of a few steps in the middle of a level; at least of one."""
         state = self._state(splats)
         state.iteration = _middle(self._task.schedule, level)
@@ -201,10 +184,10 @@ class _Probe:
         timer = _StepTimer(self._now, self._each)
         with suppress(_Enough):
             fit(state, self._task, state.iteration + len(self._views), (timer,))
-        times = [1e3 * (end - begin) for begin, end in pairwise(timer.marks)]
-        return statistics.fmean(times[_WARM:])
+        return statistics.fmean(
+            [end - begin for begin, end in pairwise(timer.marks)][_WARM:])
 
-    def report(self) -> LevelCost:
+    def report(self) -> Cost:
         """Returns the cost of a look at all validation views, from one at the first of them."""
         values = []
         for splats in (self.small, self.large):
@@ -212,16 +195,16 @@ class _Probe:
             state.iteration = _LENGTH
             begin = self._now()
             validation_psnr(state, replace(self._task, validation=self._looks))
-            values.append(1e3 * (self._now() - begin) * self._factor)
-        return self._line(1, *values)
+            values.append((self._now() - begin) * self._factor)
+        return self._line(*values)
 
-    def save_ms(self, scratch: Path) -> float:
-        """Returns the milliseconds that a checkpoint takes for every thousand Gaussians."""
+    def save(self, scratch: Path) -> Cost:
+        """Returns the cost of a checkpoint."""
         state = self._state(self.small)
         begin = self._now()
         save_state(scratch, state)
         delete(scratch)
-        return 1e3 * (self._now() - begin) / (len(self.small) / 1000)
+        return Cost(each=(self._now() - begin) / (len(self.small) / 1000))
 
     def _now(self) -> float:
         if self._task.device.type == "cuda":  # pragma: no cover

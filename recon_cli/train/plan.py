@@ -24,7 +24,8 @@ from recon_cli.context import StageContext
 from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView
-from recon_cli.train.cost import CostModel, calibrate
+from recon_cli.time_estimate import TimeEstimator, format_minutes
+from recon_cli.train.cost import calibrate, list_work
 from recon_cli.train.finished_model import FinishedModel
 from recon_cli.train.fit.initialize import first_state, restore_state
 from recon_cli.train.fit.schedule import RECIPES, Schedule, make_schedule
@@ -114,7 +115,7 @@ def probe_config(asked: TrainConfig, facts: Facts) -> RunConfig:
 
 
 def make_plan(
-    asked: TrainConfig, facts: Facts, cost: CostModel, *, left: float | None = None,
+    asked: TrainConfig, facts: Facts, estimator: TimeEstimator, *, left: float | None = None,
     model: FinishedModel | None = None,
 ) -> TrainPlan:
     """Returns the plan, whose steps take the seconds that are `left` where minutes are asked for.
@@ -133,12 +134,13 @@ def make_plan(
         return TrainPlan(
             iterations=iterations, max_gaussians=most, max_size=config.max_size,
             first_gaussians=first, detail=facts.detail,
-            seconds=round(_LONGER * cost.run_seconds(schedule, first), 2),
-            cost=dataclasses.asdict(cost), continues_at=continues_at)
+            seconds=round(
+                _LONGER * estimator.total(list_work(schedule, first, estimator.costs)), 2),
+            cost=dataclasses.asdict(estimator), continues_at=continues_at)
 
     if asked.minutes is None:
         return at(first_config(asked).iterations)
-    left = 60 * asked.minutes - cost.seconds if left is None else left
+    left = 60 * asked.minutes - estimator.seconds if left is None else left
     return at(_largest(lambda steps: at(steps).seconds <= left, _SMALLEST_RUN, _LONGEST_RUN))
 
 
@@ -302,10 +304,10 @@ def _plan_in_time(
 
     def plan() -> TrainPlan:
         left = max(deadline.left, STEPS_SHARE * deadline.seconds)
-        return make_plan(asked, facts, cost, left=left, model=model)
+        return make_plan(asked, facts, estimator, left=left, model=model)
 
     asked = search(asked, probe_config(asked, facts))
-    cost = _measure_cost(asked, facts, task, scene, out)
+    estimator = _measure_cost(asked, facts, task, scene, out)
     if deadline.limited:  # longer than the likely run, with more room
         asked = search(asked, run_config(asked, plan()))
     return asked, plan()
@@ -353,8 +355,8 @@ def _find_late_parts(
 
 def _measure_cost(
     config: TrainConfig, facts: Facts, task: Task, scene: Scene, out: Path
-) -> CostModel:
-    """Returns the cost of a run by timed steps."""
+) -> TimeEstimator:
+    """Returns the estimator of a run by timed steps."""
     seconds = CALIBRATION_SECONDS
     if config.minutes is not None:
         seconds = CALIBRATION_SHARE * 60 * config.minutes
@@ -377,7 +379,7 @@ def _report_plan(plan: TrainPlan, config: TrainConfig, facts: Facts, ctx: StageC
     if config.minutes is not None and steps < LEAST_STEPS * usual:
         ctx.notice(f"{60 * config.minutes:.0f} s of training are too short: {steps:,} steps take "
                    f"{plan.seconds:.0f} s, and a {config.quality} run has {usual:,}. The scene "
-                   f"will be blurred; about {plan.seconds * usual / steps / 60:.1f} minutes of "
+                   f"will be blurred; about {format_minutes(plan.seconds * usual / steps)} of "
                    "training would not leave it so.")
 
 

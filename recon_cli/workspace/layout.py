@@ -94,12 +94,7 @@ class Workspace:
             WorkspaceError: another process holds it, or it cannot be made.
         """
         made = [path for path in (self.root, *self.root.parents) if not os.path.lexists(path)]
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise WorkspaceError(
-                f"The workspace {self.root} cannot be made: {error.strerror}.",
-                hint="Give another folder with -w.") from error
+        make_folder(self.root, "-w")
         try:
             with hold_lock(self.root, verb), disk_errors(self.root, f"running {verb}"):
                 self.recover()
@@ -432,6 +427,16 @@ def move(source: Path, target: Path) -> None:
         copy.rename(target)
         sync_folder(target.parent)
         remove(source)
+
+
+def make_folder(folder: Path, option: str = "--out") -> None:
+    """Makes a folder that an option names; WorkspaceError where it cannot be made."""
+    try:
+        with disk_errors(folder, "making it"):
+            folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WorkspaceError(f"The folder {folder} cannot be made: {error.strerror}.",
+                             hint=f"Give another folder with {option}.") from error
 
 
 @contextmanager

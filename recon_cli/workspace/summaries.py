@@ -231,7 +231,7 @@ class TrainPlan(JsonRecord):
     first_gaussians: int
     detail: int  # pixels of a mean training view that hold detail
     seconds: float  # expected for the training, with reports and checkpoints
-    cost: Mapping[str, Any]  # what the parts of a run take: `train.cost.CostModel`
+    cost: Mapping[str, Any]  # what the parts of a run take: `time_estimate.TimeEstimator`
     needs: tuple[TrialDecision, ...] = ()
     # steps of the finished run that this one goes on from, 0 for an imported scene; None where it
     # begins anew

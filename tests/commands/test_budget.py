@@ -8,9 +8,12 @@ import pytest
 
 from recon_cli.commands import budget
 from recon_cli.commands.options import Call
+from recon_cli.config.stages import IngestConfig
+from recon_cli.time_estimate import COSTS, TimeEstimator
 from recon_cli.workspace.atomic import read_json
 
-SLOWNESS = 1.5
+MACHINE = TimeEstimator(COSTS, slowness=1.5)
+SCORES = 1.5 * COSTS["scores"].seconds()
 
 
 class FakeRun:
@@ -23,7 +26,7 @@ class FakeRun:
         self.now, self.ran, self.seconds, self.longer = 0.0, [], seconds, longer
         self.pruning, self.training = pruning, 0.0
         for name, value in {
-                "run_stages": self.run, "measure_slowness": lambda _: SLOWNESS,
+                "run_stages": self.run, "measure_machine": lambda _: MACHINE,
                 "_most_frames": self.choose_frames, "_report_frames": lambda *_: None,
                 "_pruning_seconds": lambda _: self.pruning * self.training}.items():
             monkeypatch.setattr(budget, name, value)
@@ -48,7 +51,7 @@ class FakeRun:
                          "prune": self.pruning * self.training}[stage]
 
 
-USUAL = {"ingest": 8.0, "denoise": 3.0, "sfm": 40.0, "place": 0.0, "evaluate": 20.0, "export": 10.0}
+USUAL = {"ingest": 8.0, "denoise": 3.0, "sfm": 40.0, "place": 2.0, "evaluate": 20.0, "export": 10.0}
 
 
 def run(tmp_path, clock, minutes, *, with_prune=True):
@@ -73,9 +76,8 @@ def test_the_parts_of_a_run_add_up_to_its_minutes(tmp_path, monkeypatch, minutes
 def test_cameras_get_a_share_of_what_ingest_left(tmp_path, monkeypatch):
     clock = FakeRun(monkeypatch, {**USUAL, "ingest": 30.0})
     run(tmp_path, clock, 4.0)
-    scores = budget._SCORES * SLOWNESS
-    assert clock.left_at_first == pytest.approx(240 - scores)
-    assert clock.sfm_left == pytest.approx(budget._SFM * (240 - 30 - scores) - USUAL["denoise"])
+    assert clock.left_at_first == pytest.approx(240 - SCORES)
+    assert clock.sfm_left == pytest.approx(budget._SFM * (240 - 30 - SCORES) - USUAL["denoise"])
 
 
 def test_pruning_that_has_no_time_is_left_out_and_said(tmp_path, monkeypatch, caplog):
@@ -90,7 +92,7 @@ def test_training_gets_the_time_of_a_pruning_that_would_be_too_short(tmp_path, m
     chosen = run(tmp_path, clock, 2.0)
     assert chosen["prune"] is False
     assert 60 * chosen["train_minutes"] == pytest.approx(
-        120 - 8 - 3 - 50 - budget._SCORES * SLOWNESS, abs=0.5)
+        120 - 8 - 3 - 50 - 2 - SCORES, abs=0.5)
     assert 0.85 <= clock.now / 120 <= 1.15
 
 
@@ -98,3 +100,17 @@ def test_a_run_that_goes_on_keeps_what_was_chosen(tmp_path, monkeypatch):
     chosen = run(tmp_path, FakeRun(monkeypatch, USUAL), 4.0)
     slow = FakeRun(monkeypatch, {**USUAL, "sfm": 150.0}, pruning=9.0)
     assert run(tmp_path, slow, 4.0) == chosen
+
+
+def test_as_many_frames_are_kept_as_get_cameras_in_time(sample_video, tmp_path):
+    def count(seconds, machine=MACHINE):
+        return budget._most_frames((sample_video,), seconds, machine)
+
+    assert count(0.0) == budget.LEAST_FRAMES
+    assert count(1e6) == IngestConfig().max_frames
+    seconds = 100.0
+    fitting = count(seconds)
+    assert budget.LEAST_FRAMES < fitting < IngestConfig().max_frames
+    assert count(seconds, TimeEstimator(COSTS, slowness=3.0)) < fitting
+    assert count(seconds, TimeEstimator(COSTS, threads=8)) > fitting
+    assert budget._most_frames((tmp_path,), seconds, MACHINE) is None  # no video

@@ -31,7 +31,7 @@ def _fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for module in (jobs, stages, workspace):
         monkeypatch.setattr(module, "STAGES", fake_stages.TABLE)
     monkeypatch.setattr(
-        stages, "end_run", lambda call, **_: click.echo(f"the end of {call.workspace}"))
+        stages, "end_run", lambda job, **_: click.echo(f"the end of {job.workspace.root.name}"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("RECON_WORKSPACE", raising=False)
     (tmp_path / "room.mp4").write_text("a video")

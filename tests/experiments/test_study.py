@@ -287,7 +287,7 @@ def test_an_interrupted_study_says_so(studied, tmp_path, capsys, monkeypatch):
     (["--scenes", "room", "--set", "train.validation=0.2"], 2, "has no effect here"),
     (["--scenes", "room", "--set", "compute.threads=2"], 2, "has no effect here"),
     (["--scenes", "room", "--out", "file"], 2, "--out"),
-    (["--scenes", "room", "--out", "file/below"], 7, "cannot be created"),
+    (["--scenes", "room", "--out", "file/below"], 7, "cannot be made"),
     (["--scenes", "room", "--set", "ingest.holdout=none"], 5, "No held-out view"),
 ])
 def test_what_cannot_be_done_is_refused_before_training(

@@ -18,6 +18,7 @@ from posed_sets import make_replica
 
 from recon_cli.cli import main
 from recon_cli.commands import budget
+from recon_cli.time_estimate import COSTS, Cost
 
 pytestmark = pytest.mark.integration
 
@@ -83,7 +84,7 @@ def test_the_same_command_again_finds_everything_done(filmed, sample_video):
 
 def test_a_time_for_the_whole_run_is_a_choice_that_is_kept(tmp_path, sample_video, monkeypatch):
     # without these seconds put aside for scores, and for training at least, it takes a minute
-    monkeypatch.setattr(budget, "_SCORES", 1.0)
+    monkeypatch.setitem(COSTS, "scores", Cost(1.0))
     monkeypatch.setattr(budget, "_LEAST_TRAINING", 1.0)
     words = ["run", sample_video, *FRAMES, "--minutes", 0.4, "--set", "sfm.max_features=1500",
              "--set", "train.max_size=96"]

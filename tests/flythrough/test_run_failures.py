@@ -85,7 +85,7 @@ def test_a_folder_of_other_files_is_left_alone(room, tmp_path, capsys):
 def test_a_folder_that_cannot_be_made_is_an_error(room, tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert render(room, *SHORT, "--out", tmp_path / "file" / "out") == 7
-    assert "cannot be created" in capsys.readouterr().err
+    assert "cannot be made" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("number", "said"), [

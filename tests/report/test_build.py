@@ -4,15 +4,18 @@ import dataclasses
 import errno
 import json
 import os
+import re
 import shutil
 
 import numpy as np
 import pytest
-from report_workspace import TABLE, change, page_of, report, section
+from jinja2 import ChoiceLoader, DictLoader
+from report_workspace import RUN, TABLE, change, page_of, report, section
 
 from recon_cli.cli import main
 from recon_cli.io.images import write_png
 from recon_cli.report import build
+from recon_cli.report.sections import SECTIONS, Section
 from recon_cli.workspace import atomic
 from recon_cli.workspace.digests import read_source
 from recon_cli.workspace.layout import Workspace
@@ -66,6 +69,24 @@ def test_every_option_of_every_stage_is_there_with_what_was_decided(workspace):
             assert f'<th scope="row">{name}</th>' in settings
     decided = json.loads((workspace / "train" / "config.json").read_text())["max_size"]
     assert f'max_size</th><td class="text">automatic</td><td class="text">{decided}<' in settings
+
+
+def test_a_section_is_a_row_and_its_template(workspace, monkeypatch):
+    templates = ChoiceLoader([DictLoader({"new.html.j2": "<p>{{ steps }} steps</p>"}),
+                              build._environment().loader])
+    monkeypatch.setattr(build._environment(), "loader", templates)
+    row = Section("new", "A new one", ("train",), lambda stages, _: {
+        "steps": stages["train"].summary["iterations"]})
+    monkeypatch.setattr(build, "SECTIONS", (*SECTIONS, row))
+    (workspace / "recon.toml").write_text("[train]\niterations = 7\n")
+    page = page_of(workspace)
+    made = section(page, "new")
+    assert f"<p>{RUN['iterations']} steps</p>" in made
+    assert "<h2>A new one</h2>" in made
+    assert "<strong>train is stale</strong>" in made
+    names = [row.name for row in SECTIONS] + ["new"]
+    assert re.findall(r'role="tab" [^>]*aria-controls="(\w+)"', page) == names
+    assert re.findall(r'<section [^>]*id="(\w+)"', page) == names
 
 
 def test_an_empty_workspace_is_4_and_names_the_first_command(tmp_path, capsys):

@@ -11,7 +11,7 @@ from recon_cli.evaluation.scores import Metrics, ModelMetrics, ViewScore
 from recon_cli.io.images import write_png
 from recon_cli.report.gallery import (
     ENCODINGS,
-    MOST_ERROR,
+    Gallery,
     apply_colormap,
     build_gallery,
     draw_difference,
@@ -28,7 +28,7 @@ def level(value):
 
 
 def test_an_error_of_sixteen_steps_is_a_quarter_of_the_colours():
-    assert MOST_ERROR == 64
+    assert Gallery.most_error == 64
     colors = draw_difference(gray(10), gray(26), None, 100)
     assert (colors == level(64)).all()
     assert (draw_difference(gray(10), gray(10), None, 100) == level(0)).all()

@@ -10,12 +10,12 @@ import summaries
 from facts import assert_facts
 from sfm_inputs import run, run_here, run_place, texture, turning, write_inputs
 
+from recon_cli import time_estimate
 from recon_cli.config.stages import SfmConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, SfmError
 from recon_cli.sfm import database
 from recon_cli.sfm.job import CameraGroup
-from recon_cli.sfm.mapping import time_estimate
 from recon_cli.sfm.results import MappingResult, ModelResult
 from recon_cli.sfm.segments.segments import SegmentRuns
 from recon_cli.stages import place, sfm

@@ -8,17 +8,19 @@ import pytest
 from tiny_task import first_state, same, tiny_task
 
 from recon_cli.config.stages import RunConfig
-from recon_cli.train.cost import CostModel, LevelCost, calibrate, counts
+from recon_cli.time_estimate import Cost, TimeEstimator
+from recon_cli.train.cost import REPORT, SAVE, calibrate, counts, list_work, step_kind
 from recon_cli.train.fit.loop import fit
 from recon_cli.train.fit.schedule import Schedule
 
-FREE = LevelCost(1, 0.0, 0.0)
+FREE = Cost()
 
 
-def model(**levels):
-    costs = {1: (0.0, 0.0), 2: (0.0, 0.0), 4: (0.0, 0.0)}
-    costs |= {int(name[1:]): value for name, value in levels.items()}
-    return CostModel(tuple(LevelCost(level, *cost) for level, cost in costs.items()), FREE, 0, 0)
+def run_seconds(schedule, first, *, steps=None, report=FREE, save=FREE):
+    """The seconds of a run, by the costs of its steps by level; what is not given is free."""
+    costs = {step_kind(level): (steps or {}).get(level, FREE) for level in (1, 2, 4)}
+    costs |= {REPORT: report, SAVE: save}
+    return TimeEstimator(costs).total(list_work(schedule, first, costs))
 
 
 def plan(**changes):
@@ -26,32 +28,33 @@ def plan(**changes):
 
 
 def test_a_fixed_cost_is_paid_at_each_step_of_its_level():
-    assert model(_4=(10.0, 0.0)).run_seconds(plan(), 2000) == 0
-    assert model(_2=(10.0, 0.0)).run_seconds(plan(), 2000) == pytest.approx(4.0, rel=0.02)
-    assert model(_1=(10.0, 0.0)).run_seconds(plan(), 2000) == pytest.approx(6.0, rel=0.02)
+    for level, seconds in ((4, 0), (2, 4.0), (1, 6.0)):
+        assert run_seconds(plan(), 2000, steps={level: Cost(0.01)}) == pytest.approx(
+            seconds, rel=0.02)
 
 
 def test_a_run_whose_count_stays_pays_for_it_at_every_step():
-    costs = model(_4=(0.0, 1.0), _2=(0.0, 1.0), _1=(0.0, 1.0))
-    assert costs.run_seconds(plan(), 8000) == pytest.approx(8.0)
-    assert costs.run_seconds(plan(iterations=1), 8000) == pytest.approx(0.008)
+    steps = dict.fromkeys((1, 2, 4), Cost(each=0.001))
+    assert run_seconds(plan(), 8000, steps=steps) == pytest.approx(8.0)
+    assert run_seconds(plan(iterations=1), 8000, steps=steps) == pytest.approx(0.008)
 
 
 def test_reports_and_checkpoints_are_counted():
-    reports = replace(model(), report=LevelCost(1, 50.0, 0.0))
-    assert reports.run_seconds(plan(), 8000) == pytest.approx(0.5)
-    saves = replace(model(), save_ms=2.0)
-    assert saves.run_seconds(plan(checkpoint_every=100), 8000) == pytest.approx(0.16)
+    assert run_seconds(plan(), 8000, report=Cost(0.05)) == pytest.approx(0.5)
+    saves = run_seconds(plan(checkpoint_every=100), 8000, save=Cost(each=0.002))
+    assert saves == pytest.approx(0.16)
 
 
 def test_long_checkpoints_take_a_tenth_of_the_steps():
-    costs = replace(model(_4=(3.0, 0.0), _2=(3.0, 0.0), _1=(3.0, 0.0)), save_ms=50.0)
+    def seconds(count, **changes):
+        return run_seconds(plan(**changes), count, steps=dict.fromkeys((1, 2, 4), Cost(0.003)),
+                           save=Cost(each=0.05))
+
     # 8,000 Gaussians take .4 s to save, each hundred steps .3 s
-    assert costs.run_seconds(plan(checkpoint_every=100), 8000) == pytest.approx(3.3)
+    assert seconds(8000, checkpoint_every=100) == pytest.approx(3.3)
     # and where there are few it is not worth a thought
-    assert costs.run_seconds(plan(checkpoint_every=500), 8000) == pytest.approx(3.3)
-    assert costs.run_seconds(plan(checkpoint_every=1000, max_gaussians=4000), 4000) == (
-        pytest.approx(3.2))
+    assert seconds(8000, checkpoint_every=500) == pytest.approx(3.3)
+    assert seconds(4000, checkpoint_every=1000, max_gaussians=4000) == pytest.approx(3.2)
 
 
 @pytest.mark.parametrize("iterations", [1, 7, 99, 1000, 30_000])
@@ -90,21 +93,21 @@ def calibrated(tmp_path, *, seconds=100.0, clock=None, task=None):
 
 def test_what_every_step_takes_is_found_at_each_level_and_nothing_is_left_behind(tmp_path):
     clock = Ticks()
-    cost = calibrated(tmp_path, clock=clock)
-    assert [level.level for level in cost.levels] == [1, 2]
-    for level in cost.levels:
-        assert level.ms(30) == pytest.approx(1.0)
-        assert level.each_ms == pytest.approx(0.0, abs=1e-6)
-    assert 0 < cost.seconds < clock.now
+    found = calibrated(tmp_path, clock=clock)
+    assert found.costs.keys() == {step_kind(2), step_kind(1), REPORT, SAVE}
+    for level in (1, 2):
+        assert found.costs[step_kind(level)].seconds(0.03) == pytest.approx(0.001)
+        assert found.costs[step_kind(level)].each == pytest.approx(0.0, abs=1e-9)
+    assert (found.threads, found.slowness) == (1, 1)  # what is timed here is as slow as it is here
+    assert 0 < found.seconds < clock.now
     assert list(tmp_path.iterdir()) == []
 
 
 def test_when_time_is_used_up_finer_levels_are_told_by_their_pixels(tmp_path):
-    cost = calibrated(tmp_path, seconds=0.0)
-    fine, half = cost.levels
-    assert half.fixed_ms == pytest.approx(1.0)
-    assert fine.fixed_ms == pytest.approx(4.0)
-    assert cost.report.fixed_ms == pytest.approx(4 / 3)
+    costs = calibrated(tmp_path, seconds=0.0).costs
+    assert costs[step_kind(2)].fixed == pytest.approx(0.001)
+    assert costs[step_kind(1)].fixed == pytest.approx(0.004)
+    assert costs[REPORT].fixed == pytest.approx(0.004 / 3)
 
 
 def test_timing_changes_nothing_of_the_run(tmp_path):
@@ -118,4 +121,4 @@ def test_timing_changes_nothing_of_the_run(tmp_path):
 
 def test_a_scene_without_validation_views_has_reports_that_cost_nothing(tmp_path):
     task = replace(tiny_task(RunConfig(iterations=60, max_gaussians=90)), validation=[])
-    assert calibrated(tmp_path, task=task).report.ms(90) == 0
+    assert calibrated(tmp_path, task=task).costs[REPORT].seconds(0.09) == 0

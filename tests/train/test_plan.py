@@ -13,8 +13,9 @@ from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.errors import ConfigError
 from recon_cli.scene.train_view import TrainView
+from recon_cli.time_estimate import Cost, TimeEstimator
 from recon_cli.train import plan
-from recon_cli.train.cost import CostModel, LevelCost
+from recon_cli.train.cost import REPORT, SAVE, step_kind
 from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.parts.decisions import NO_TIME, skip_trial
 from recon_cli.train.parts.stereo import SurfacePoints
@@ -23,9 +24,15 @@ from recon_cli.train.plan import QUALITIES, Facts, make_plan
 from recon_cli.workspace.summaries import TrainPlan
 
 FACTS = Facts(detail=60_000, views=40, points=9000, room=10**9)
-FREE = LevelCost(1, 0.0, 0.0)
-# ten milliseconds a step, whatever the count
-COST = CostModel(tuple(LevelCost(level, 10.0, 0.0) for level in (1, 2, 4)), FREE, 0.0, 0.5)
+
+
+def estimator(step, seconds=0.5):
+    """The estimator of runs whose steps take the same at each level."""
+    steps = dict.fromkeys(map(step_kind, (1, 2, 4)), step)
+    return TimeEstimator({**steps, REPORT: Cost(), SAVE: Cost()}, seconds=seconds)
+
+
+COST = estimator(Cost(0.01))  # ten milliseconds a step, whatever the count
 
 
 def test_iterations_and_minutes_exclude_each_other():
@@ -242,7 +249,7 @@ def test_faint_noise_is_no_detail():
 
 def test_only_memory_limits_the_count_of_the_protocol_3dgs_and_its_time_is_told_by_a_likely_one():
     facts = replace(FACTS, room=4_000_000)
-    linear = CostModel(tuple(LevelCost(level, 0.0, 1.0) for level in (1, 2, 4)), FREE, 0.0, 0.5)
+    linear = estimator(Cost(each=0.001))
     free = make_plan(TrainConfig(protocol="3dgs"), facts, linear)
     assert (free.iterations, free.max_gaussians) == (30_000, 2_000_000)
     assert free.first_gaussians == facts.points  # all of them, as in the reference

@@ -31,12 +31,12 @@ from recon_cli.sfm.limits import (
 )
 from recon_cli.sfm.mapping import checks, mapper, merge_models, parts, skeleton, wide_lens
 from recon_cli.sfm.mapping.merge_models import ModelCandidate
-from recon_cli.sfm.mapping.time_estimate import COSTS, format_minutes
 from recon_cli.sfm.mapping.trusted_part import cuts_models, deliver_parts
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.segments import join_segments
 from recon_cli.sfm.verdict.verdict import ModelVerdict, examine
+from recon_cli.time_estimate import COSTS, TimeEstimator, Work, format_minutes
 from recon_cli.workspace.summaries import AttemptSummary, JsonRecord
 
 TRACKS = "tracks"  # the fallback that has a database of its own
@@ -47,8 +47,6 @@ RELAXED_BRIDGE = "bridge relaxed"  # with the database of the former, and lower 
 SEGMENTS = "segments"  # the fallback that joins models; it has one, too, where there are tracks
 # Frames up to which all pairs are matched at once: for less, the coarsest features save no time.
 FEW_PHOTOS = 30
-# CPU seconds of the machine of `COSTS` for a pair of 3,000 keypoints, verification included.
-PAIR_SECONDS = 0.05
 # How much longer than the first a mapping may take. Relaxed thresholds took 0.8 and 2.3 times as
 # long as the first mapping of a capture, the global mapper 0.5, 2 and 3 times.
 SLOWER = 3.0
@@ -404,9 +402,10 @@ def _try_fallback(
 
 def _count_seconds(job: MappingJob, wanted: Collection[matching.Pair], tried: int) -> float:
     """Returns the CPU seconds of all attempts with a further one, on the machine of `COSTS`."""
-    mapping = COSTS.photo_mapping if job.tracks is None else COSTS.walk_mapping
-    pairs = len(database.pair_names(job.database).union(wanted))
-    return PAIR_SECONDS * pairs + mapping * len(job.names) * (tried + SLOWER)
+    mapping = "photo_mapping" if job.tracks is None else "walk_mapping"
+    return TimeEstimator(COSTS).total([
+        Work("pair", len(database.pair_names(job.database).union(wanted))),
+        Work(mapping, len(job.names) * (tried + SLOWER))])
 
 
 def _publish_best(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import shutil
 import time
 from collections import defaultdict
@@ -29,7 +28,7 @@ from recon_cli.errors import (
 from recon_cli.io.tracks import Tracks
 from recon_cli.jobs.executor import Command, Executor
 from recon_cli.jobs.shared_jobs import JobEnd, SharedJob, run_jobs
-from recon_cli.progress import NullProgress, Progress
+from recon_cli.progress import NullProgress, Progress, limit_rate
 from recon_cli.sfm.features.keyframes import choose_keyframes
 from recon_cli.sfm.job import SPLIT, MappingJob
 from recon_cli.sfm.mapping.process import CrashError, run_job
@@ -49,7 +48,6 @@ TRIES = 2  # of a mapping process that is killed, perhaps for want of memory bes
 COMMAND = "map-segment"  # of recon, which takes JOB
 # in the folder of a segment: what to do, how much of it is done, and what the command printed
 JOB, PROGRESS, OUTPUT = "segment.json", "progress.json", "output.txt"
-_RECORD_SECONDS = 0.5  # between two writes of how much is done
 _ERRORS: dict[int, type[ReconError]] = {
     kind.exit_code: kind for kind in (FormatError, BackendError, WorkspaceError)}
 
@@ -226,14 +224,7 @@ def map_segment(file: Path) -> None:
     Raises what `run_job` raises.
     """
     job = MappingJob.read(file)
-    last = -math.inf
-
-    def record(done: int, total: int) -> None:
-        nonlocal last
-        if time.monotonic() - last >= _RECORD_SECONDS:
-            last = time.monotonic()
-            write_json(job.out / PROGRESS, [done, total])
-
+    record = limit_rate(lambda *parts: write_json(job.out / PROGRESS, parts))
     with disk_errors(job.out, "mapping a segment"):
         for left in reversed(range(TRIES)):
             try:
