@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import raises
 from safetensors.numpy import save_file
 
 from recon_cli.errors import FormatError
@@ -54,7 +55,7 @@ def test_bytes_folders_fifos_and_huge_files_are_no_json(
     (tmp_path / "large").write_text("[1, 2, 3]")
     monkeypatch.setattr(atomic, "MAX_TEXT_BYTES", 8)
     for name in ("bytes", "folder", "fifo", "large", "missing"):
-        with pytest.raises(FormatError, match="cannot be read as JSON") as caught:
+        with raises(FormatError, "JSON") as caught:
             read_json(tmp_path / name, hint="Do this.")
         assert caught.value.hint == "Do this."
 
