@@ -1,8 +1,8 @@
 """Breaks the package on purpose and says which tests notice: `make mutants`.
 
 Each break is a slip that a real change might make. It is applied to a copy of the tree, whose tests
-run until one fails: those called as the module, those of its folder, all of `make test`, those of
-`make test-rest`. A break whose text the package no longer has is an error.
+run until one fails: those called as the module or that import it, those of its folder, all of
+`make test`, those of `make test-rest`. A break whose text the package no longer has is an error.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ MUTANTS = (
            "return block.splats.select(torch.from_numpy(block.cell.owns(means)))",
            "return block.splats"),
     # sfm
-    Mutant("matches-not-mutual", "sfm/features/matching.py",
-           "(best == most[nearest]) & (best >=", "(best >="),
+    Mutant("ratio-one-way", "sfm/features/matching.py",
+           "axis=1)[_is_clear(best[rows], back)]", "axis=1)"),
     Mutant("pair-not-turned-round", "sfm/features/matching.py",
            "                geometry.invert()\n", ""),
     Mutant("gap-in-time", "sfm/verdict/verdict.py",
@@ -248,14 +248,19 @@ def list_failed(arguments: Sequence[str], *, full: bool = False) -> list[str]:
 
 
 def list_runs(mutant: Mutant) -> dict[str, tuple[str, ...]]:
-    """Returns what pytest gets in each ring; nothing where a ring has no tests."""
+    """Returns what pytest gets in each ring; nothing where it has no tests."""
     package, _, rest = mutant.file.partition("/")
-    stem = Path(mutant.file).stem
-    folder = f"tests/{package}" if rest else f"tests/test_{stem}.py"
-    own = sorted(path.relative_to(ROOT).as_posix()
-                 for path in (ROOT / folder).rglob(f"test_{stem}*.py"))
-    return {"module": ("-m", QUICK, *own) if own else (), "folder": ("-m", QUICK, folder),
-            "test": ("-m", QUICK, *WORKERS), "rest": ("-m", f"{HEAVY[1]} or hypothesis", *WORKERS)}
+    module = Path(mutant.file).with_suffix("")
+    imports = re.compile(
+        rf"\brecon_cli\.{'.'.join(module.parts)}\b"
+        rf"|from {'.'.join(('recon_cli', *module.parts[:-1]))} import .*\b{module.name}\b")
+    own = [path.relative_to(ROOT).as_posix() for path in sorted(
+        ROOT.glob("tests/**/test_*.py"), key=lambda path: not path.stem.startswith(
+            f"test_{module.name}")) if path.stem.startswith(f"test_{module.name}")
+        or imports.search(path.read_text(encoding="utf-8"))]
+    return {"module": ("-m", QUICK, *own) if own else (), "test": ("-m", QUICK, *WORKERS),
+            "folder": ("-m", QUICK, f"tests/{package}" if rest else own[0]),
+            "rest": ("-m", f"{HEAVY[1]} or hypothesis", *WORKERS)}
 
 
 def judge(mutant: Mutant, rings: Iterable[str]) -> Caught:
@@ -266,8 +271,8 @@ def judge(mutant: Mutant, rings: Iterable[str]) -> Caught:
     path.write_text(apply(mutant), encoding="utf-8")
     os.utime(path, (times.st_atime, times.st_mtime + 2))  # bytecode goes by whole seconds
     try:
-        for ring in rings:
-            if runs[ring] and (failed := list_failed(["-x", *runs[ring]], full=ring == "rest")):
+        for ring in filter(runs.get, rings):
+            if failed := list_failed(["-x", *runs[ring]], full=ring == "rest"):
                 return Caught(ring, failed[0], time.monotonic() - begin)
     finally:
         path.write_bytes(whole)

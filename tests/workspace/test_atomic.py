@@ -29,6 +29,17 @@ def test_a_file_gets_the_permissions_that_the_umask_says(
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_file_is_flushed_before_it_replaces_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, replace = list[str](), os.replace
+    monkeypatch.setattr(os, "fsync", lambda _file: calls.append("flush"))
+    monkeypatch.setattr(os, "replace", lambda *paths: (calls.append("rename"), replace(*paths)))
+    atomic.write_bytes(tmp_path / "a", b"x")
+    assert calls[:calls.index("rename")] == ["flush"]
+    assert (tmp_path / "a").read_bytes() == b"x"
+
+
 @pytest.mark.parametrize(("text", "reason"), [
     ("NaN", "not a finite number"), ('{"a": Infinity}', "not a finite number"),
     ("1e999", "not a finite number"), ("9" * 5000, "not a finite number"),
