@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from facts import raises
 from scenes import camera_at
 from tiny_task import tiny_task
 
@@ -29,7 +30,7 @@ COST = CostModel(tuple(LevelCost(level, 10.0, 0.0) for level in (1, 2, 4)), FREE
 
 
 def test_iterations_and_minutes_exclude_each_other():
-    with pytest.raises(ConfigError, match="iterations is 100 and minutes is 2") as caught:
+    with raises(ConfigError, 100, 2, "iterations") as caught:
         TrainConfig(iterations=100, minutes=2)
     assert "--minutes" in caught.value.hint
 
