@@ -222,7 +222,7 @@ def test_what_was_changed_by_hand_is_kept_under_another_name_where_it_is_written
     assert (folder / "splats.spz").read_bytes() == b"mine"
     assert stale_formats(ws) == {"spz": "output splats.spz was changed by hand"}
     assert run("export", ws, *BOX) == 0  # and is still named so
-    assert_facts(states(ws)["export.spz"], "splats.spz")
+    assert "output splats.spz was changed by hand" in states(ws)["export.spz"]
     assert run("export", ws, *BOX, "--format", "spz") == 0
     assert (folder / "splats.kept.spz").read_bytes() == b"mine"
     assert (folder / "splats.kept.ply").read_bytes() == mine
@@ -320,7 +320,7 @@ def test_an_export_of_the_version_before_opens_and_is_named_as_that(ws, capsys):
         path.unlink()
     old.write(folder)
     expected = files_of(root)
-    assert_facts(states(root)["export"], 6, 7, "stage", "version")
+    assert "stage version 6 -> 7" in states(root)["export"]
     assert run("export", root) == 0
     assert "splats.spz is " in capsys.readouterr().err
     assert files_of(root) == expected
