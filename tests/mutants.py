@@ -104,7 +104,7 @@ MUTANTS = (
            "np.stack([column, line], axis=1)", "np.stack([line, column], axis=1)"),
     Mutant("angle-of-partners", "stereo/depths.py",
            "_NARROWER, _WIDER)\n", "_WIDER, _NARROWER)\n"),
-    Mutant("span-of-one-view", "trust/support.py", " * (self.count > 1)", ""),
+    Mutant("half-the-span", "trust/support.py", "2 * torch.arccos(cosine", "torch.arccos(cosine"),
     Mutant("least-trusted-last", "trust/agreement.py", "np.argsort(-order", "np.argsort(order"),
     # capture, denoise
     Mutant("blurriest-frame", "capture/frame_selection.py",
