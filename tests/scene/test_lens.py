@@ -10,6 +10,7 @@ def test_a_resized_image_keeps_its_rays_and_its_distortion():
     half = lens.resized(300, 170)
     assert (half.width, half.height) == (300, 170)
     assert half.params == (150.0, 155.0, 149.5, 85.5, 0.1, -0.2, 0.001, 0.002)
+    assert lens.resized(300, 340).params[:4] == (150.0, 310.0, 149.5, 171.0)
 
 
 def test_a_single_focal_length_takes_the_mean_of_both_scales():
