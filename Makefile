@@ -17,7 +17,7 @@ FLOORS := .venv-floors
 # Bytecode is kept, whatever the environment says: else each process compiles all modules anew, and
 # pytest rewrites each test's assertions.
 unexport PYTHONDONTWRITEBYTECODE
-.PHONY: demo test times test-other-cpu test-floors test-rest test-all coverage faults check docs clean
+.PHONY: demo test times test-other-cpu test-floors test-rest test-all coverage mutants faults check docs clean
 
 demo: $(READY)
 	$(BIN)/recon demo
@@ -50,6 +50,10 @@ times: $(DEV)
 
 coverage: $(DEV)
 	$(PYTEST) --cov=recon_cli --cov-report=term
+
+# Deliberate breaks of the package, and the first test that notices each: ONLY="--only NAME".
+mutants: $(DEV)
+	$(BIN)/python tests/mutants.py $(ONLY)
 
 # Kills, full disks, damaged files and hostile inputs, at random from a seed.
 SEED ?= 1

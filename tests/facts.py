@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from recon_cli.errors import ReconError
 
 
 def assert_facts(text: str, *facts: object) -> None:
@@ -13,3 +19,12 @@ def assert_facts(text: str, *facts: object) -> None:
         missing = [fact for fact, pattern in zip(facts, patterns, strict=True)
                    if not pattern.search(text)]
         raise AssertionError(f"no line holds all of {facts} (missing: {missing}) in:\n{text}")
+
+
+@contextmanager
+def raises(kind: type[ReconError], *facts: object) -> Iterator[pytest.ExceptionInfo[ReconError]]:
+    """Expects an error that says what to type next and whose message names every fact."""
+    with pytest.raises(kind) as caught:
+        yield caught
+    assert caught.value.hint
+    assert_facts(caught.value.message, *facts)

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.api import Camera, FormatError, InputError, look_at, make_camera, read_cameras
 from recon_cli.datasets.transforms import write_transforms
@@ -103,7 +104,7 @@ def test_transforms_need_no_images_where_they_state_a_size(
     value = json.loads(path.read_text())
     del value["w"]
     path.write_text(json.dumps(value))
-    with pytest.raises(FormatError, match="states no size"):
+    with raises(FormatError, "states", "size"):
         read_cameras(path)
 
 
@@ -112,16 +113,16 @@ def test_distorted_cameras_are_refused_or_taken_for_pinholes(tmp_path) -> None:
     path.write_text(json.dumps({
         "fl_x": 50, "fl_y": 51, "cx": 32, "cy": 24, "w": 64, "h": 48, "k1": 0.1,
         "frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]}))
-    with pytest.raises(InputError, match=r"1 of 1 cameras .* lens distortion"):
+    with raises(InputError, 1, "distortion"):
         read_cameras(path)
     camera = read_cameras(path, ignore_distortion=True)["a.png"]
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 51, 32, 24)
 
 
 def test_what_is_no_data_set_is_refused(tmp_path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
+    with raises(InputError):
         read_cameras(tmp_path / "none")
-    with pytest.raises(InputError, match="not a data set"):
+    with raises(InputError, "data"):
         read_cameras(tmp_path)
 
 

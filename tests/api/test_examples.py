@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from facts import assert_facts
 from one_gaussian_scene import one_gaussian
 from tiny_room import make_room, write_options
 
@@ -92,7 +93,7 @@ def test_a_workspace_is_run(monkeypatch, tmp_path, sample_video, capsys) -> None
     shutil.copy(sample_video, tmp_path / "room.mp4")
     execute("Run a workspace", monkeypatch, tmp_path)
     out = capsys.readouterr().out
-    assert out.startswith("16 frames 16 cameras ")
+    assert_facts(out, 16, "frames", "cameras")
     assert re.search(r"^pruned: \d\d\.\d\d dB", out, re.M)
     assert (tmp_path / "room" / "report.html").is_file()
 

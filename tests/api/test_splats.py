@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from facts import raises
 from one_gaussian_scene import one_gaussian
 from splat_cases import edge_splats, few
 
@@ -120,12 +121,12 @@ def test_a_ply_comes_back_bit_for_bit_with_what_it_says_of_itself(tmp_path) -> N
 def test_a_file_that_cannot_be_written_is_refused_and_what_is_there_stays(tmp_path) -> None:
     old = tmp_path / "old.ksplat"
     old.write_text("old")
-    with pytest.raises(FormatError, match="only read"):
+    with raises(FormatError):
         one_gaussian().write(old)
     assert old.read_text() == "old"
-    with pytest.raises(InputError, match="does not exist"):
+    with raises(InputError):
         one_gaussian().write(tmp_path / "none" / "a.ply")
-    with pytest.raises(FormatError, match="not of a known format"):
+    with raises(FormatError, "known", "format"):
         one_gaussian().write(tmp_path / "a.txt")
     with pytest.raises(FormatError):
         Splats.read(tmp_path / "missing.ply")

@@ -9,6 +9,7 @@ import tarfile
 import zipfile
 
 import pytest
+from facts import raises
 
 from recon_cli.capture.known_files import is_archive, refuse_other_file
 from recon_cli.errors import InputError
@@ -31,7 +32,7 @@ def pack(path):
 def test_an_archive_is_refused_with_the_command_that_unpacks_it(tmp_path, name):
     path = pack(tmp_path / name)
     assert is_archive(path)
-    with pytest.raises(InputError, match=r"archive, not a video") as caught:
+    with raises(InputError, "archive", "video") as caught:
         refuse_other_file(path)
     command = caught.value.hint.split(": ", 1)[1].split(" && recon ingest ")
     program = shlex.split(command[0].split(" && ")[1])[0]
@@ -45,7 +46,7 @@ def test_an_archive_is_refused_with_the_command_that_unpacks_it(tmp_path, name):
 
 def test_an_archive_is_known_by_its_content(tmp_path):
     pack(tmp_path / "walk.zip").rename(tmp_path / "walk.mp4")
-    with pytest.raises(InputError, match="is an archive, not a video"):
+    with raises(InputError, "archive", "video"):
         refuse_other_file(tmp_path / "walk.mp4")
 
 

@@ -8,6 +8,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 from media import texture, turn_heic
 from PIL import Image
 
@@ -203,7 +204,7 @@ def test_gray_jpeg_2000_of_16_bits_with_opacity_is_refused_by_name(tmp_path):
     context.width, context.height, context.pix_fmt = 64, 48, "ya16le"
     context.time_base = Fraction(1, 1)
     (tmp_path / "a.jp2").write_bytes(b"".join(map(bytes, context.encode(frame))))
-    with pytest.raises(InputError, match="LA with 16 bits") as error:
+    with raises(InputError, "LA", 16, "bits") as error:
         photo_of(tmp_path / "a.jp2")
     assert "not damaged" in error.value.hint
 
@@ -222,7 +223,7 @@ def test_bitmaps_with_five_or_six_bits_a_colour_are_read(tmp_path, masks):
 
 def test_integers_beyond_sixteen_bits_are_refused(tmp_path):
     Image.fromarray(np.full((8, 8), 70000, np.int32)).save(tmp_path / "a.tif")
-    with pytest.raises(InputError, match="70000"):
+    with raises(InputError, 70000):
         photo_of(tmp_path / "a.tif")
 
 
@@ -308,14 +309,14 @@ def test_half_a_photo_is_refused(tmp_path, name):
     Image.fromarray(noise).save(tmp_path / name)
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(data[:len(data) // 2])
-    with pytest.raises(InputError, match=f"{name} cannot be read"):
+    with raises(InputError, name):
         photo_of(tmp_path / name)
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"])
 def test_what_is_no_picture_is_refused(tmp_path, content):
     (tmp_path / "a.jpg").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.jpg cannot be read"):
+    with raises(InputError, "a.jpg"):
         inspect_photo(tmp_path / "a.jpg")
 
 
@@ -329,20 +330,20 @@ def test_a_file_that_is_no_picture_is_refused_in_plain_words(tmp_path, content, 
 
 def test_floating_point_colours_are_refused_too(tmp_path):
     cv2.imwrite(str(tmp_path / "a.tif"), np.ones((8, 8, 3), np.float32))
-    with pytest.raises(InputError, match=r"a\.tif cannot be read"):
+    with raises(InputError, "a.tif"):
         photo_of(tmp_path / "a.tif")
 
 
 def test_floating_point_pixels_are_refused_because_their_range_is_unknown(tmp_path):
     Image.fromarray(np.ones((8, 8), np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(InputError, match="floating point"):
+    with raises(InputError, "floating", "point"):
         photo_of(tmp_path / "a.tif")
 
 
 def test_pixels_that_memory_does_not_hold_are_refused(tmp_path, monkeypatch):
     Image.fromarray(picture()).save(tmp_path / "a.png")
     monkeypatch.setattr(images, "free_memory_bytes", lambda: 3072 * 10)
-    with pytest.raises(InputError, match="64x48 pixels") as error:
+    with raises(InputError, "64x48") as error:
         inspect_photo(tmp_path / "a.png")
     assert "again" not in error.value.hint
 
@@ -363,7 +364,7 @@ def test_jpeg_xl_is_named_where_its_package_is_not_installed(tmp_path, monkeypat
     (tmp_path / "a.jxl").write_bytes(b"\xff\x0a" + bytes(100))
     known = tuple(name for name in images._formats() if name != "JXL")
     monkeypatch.setattr(images, "_formats", lambda: known)
-    with pytest.raises(InputError, match="JPEG XL") as error:
+    with raises(InputError, "JPEG", "XL") as error:
         inspect_photo(tmp_path / "a.jxl")
     assert "pillow-jxl-plugin" in error.value.hint
     assert list_photos(tmp_path.iterdir()).broken
@@ -400,7 +401,7 @@ def test_documents_are_no_photos(tmp_path):
 
 def test_pixels_of_another_size_than_the_header_says_are_refused(tmp_path):
     Image.fromarray(picture()).save(tmp_path / "a.png")
-    with pytest.raises(InputError, match="64x48 pixels, but its header says 64x50"):
+    with raises(InputError, "64x48", "64x50"):
         read_photo(Photo(tmp_path / "a.png", 64, 50, None))
 
 

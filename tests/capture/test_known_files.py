@@ -5,6 +5,7 @@ import sqlite3
 
 import numpy as np
 import pytest
+from facts import assert_facts
 
 from recon_cli.capture.known_files import (
     KNOWN_FILES,
@@ -83,7 +84,7 @@ def test_what_is_read_as_a_data_set_names_the_folder_to_give(tmp_path):
     put(tmp_path / "odometry.csv", FILES["odometry.csv"][0])
     (found,) = find_foreign(tmp_path)
     assert f"recon ingest {tmp_path} uses them" in found.notice(tmp_path / "rgb.mp4")
-    assert "files that belong to it are missing" in found.notice(tmp_path)
+    assert_facts(found.notice(tmp_path), "files", "belong", "missing")
 
 
 def test_every_layout_that_a_row_names_is_read():

@@ -2,6 +2,7 @@ from pathlib import PurePosixPath
 
 import posed_sets
 import pytest
+from facts import assert_facts
 
 from recon_cli.capture.masks import find_masks, mask_folders, match_masks
 from recon_cli.capture.photo_tree import find_photo_files
@@ -58,15 +59,14 @@ def test_masks_by_stem_are_found_in_data_sets_of_every_layout(tmp_path, layout):
     touch(tmp_path / "masks" / f"{stem}.png", tmp_path / "masks" / "lost.png")
     posed = read_posed(tmp_path)
     assert [image.path.stem for image in posed.images if image.mask] == [stem]
-    assert any("1 of its images have masks" in notice for notice in posed.notices)
-    assert any("without an image are left out: lost.png" in notice for notice in posed.notices)
+    assert_facts("\n".join(posed.notices), 1, "images", "masks")
+    assert_facts("\n".join(posed.notices), "lost.png")
 
 
 def test_where_no_mask_fits_the_right_name_is_told(tmp_path):
     posed_sets.make_transforms(tmp_path)
     touch(tmp_path / "masks" / "mask_0.png")
-    assert any("0000.png must be called 0000.png.png or 0000.png" in notice
-               for notice in read_posed(tmp_path).notices)
+    assert_facts("\n".join(read_posed(tmp_path).notices), "0000.png", "0000.png.png")
 
 
 @pytest.mark.parametrize("name", [".mask/{}.png", "{}.jpg.mask.png", "{}.MASK.PNG"])

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from facts import assert_facts, raises
 from PIL import Image
 
 from recon_cli.capture.photo_tree import describe_unused, find_photo_files
@@ -31,19 +32,19 @@ def test_photos_in_subfolders_are_used_too_and_said(tmp_path):
     small(tmp_path / "a.png", tmp_path / "more" / "b.png", tmp_path / "more" / "still" / "c.png")
     files, notices = found(tmp_path)
     assert files == ["a.png", "more/b.png", "more/still/c.png"]
-    assert "2 photos in subfolders are used too: more/, more/still/" in notices
+    assert_facts(notices, 2, "more/", "more/still/")
 
 
 def test_photos_several_folders_down_are_found(tmp_path):
     small(tmp_path / "scan" / "2024" / "a.png", tmp_path / "scan" / "masks" / "a.png")
     files, notices = found(tmp_path)
     assert files == ["scan/2024/a.png"]
-    assert "holds no photos itself: those in scan/2024/ are used" in notices
+    assert_facts(notices, "scan/2024/")
 
 
 def test_several_folders_of_photos_can_all_be_given(tmp_path):
     small(tmp_path / "cam 1" / "a.png", tmp_path / "cam2" / "a.png", tmp_path / "depth" / "a.png")
-    with pytest.raises(InputError, match="2 of its subfolders do: cam 1, cam2") as caught:
+    with raises(InputError, 2, 1, "cam2") as caught:
         find_photo_files(tmp_path)
     assert f"recon ingest '{tmp_path}/cam 1' {tmp_path}/cam2" in caught.value.hint
 
@@ -53,7 +54,7 @@ def test_among_several_folders_the_one_called_images_is_taken_and_the_others_are
         small(tmp_path / name / "a.png")
     files, notices = found(tmp_path)
     assert files == ["images/a.png"]
-    assert "images_2/ holds 1 pictures" in notices
+    assert_facts(notices, "images_2/", 1)
     assert f"recon ingest {tmp_path}/renders uses it instead" in notices
 
 
@@ -79,7 +80,7 @@ def test_folders_of_depth_in_other_formats_are_named_too(tmp_path):
     for name in ("depth/a.exr", "depth/b.exr"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"exr")
-    assert "depth/ holds 2 depth maps" in found(tmp_path)[1]
+    assert_facts(found(tmp_path)[1], "depth/", 2)
 
 
 def test_masks_in_their_folder_are_no_news(tmp_path):
@@ -91,7 +92,7 @@ def test_copies_of_the_photos_above_are_left_out(tmp_path):
     small(*(tmp_path / place / f"{name}.png" for place in (".", "small") for name in "abc"))
     files, notices = found(tmp_path)
     assert files == ["a.png", "b.png", "c.png"]
-    assert "small/ holds 3 other versions of these photos" in notices
+    assert_facts(notices, "small/", 3)
 
 
 def test_workspaces_and_hidden_folders_hold_no_photos_and_links_are_named(tmp_path):
@@ -132,9 +133,9 @@ def test_of_an_app_the_best_photos_are_taken_and_its_poses_are_named(tmp_path):
         (tmp_path / "keyframes" / name / "1.json").write_text('{"t_00": 1}')
     files, notices = found(tmp_path)
     assert files == ["keyframes/corrected_images/1.jpg"]
-    assert "keyframes/corrected_cameras/ is the raw data of Polycam" in notices
-    assert "files that belong to it are missing" in notices
-    assert "poses and depth are not read" in notices
+    assert_facts(notices, "keyframes/corrected_cameras/")
+    assert_facts(notices, "files", "belong", "missing")
+    assert_facts(notices, "poses", "depth")
     inside = found(tmp_path / "keyframes" / "images")[1]
     assert f"recon ingest {tmp_path / 'keyframes'} uses them" in inside
 
@@ -142,8 +143,8 @@ def test_of_an_app_the_best_photos_are_taken_and_its_poses_are_named(tmp_path):
 def test_poses_above_a_folder_called_images_are_named_too(tmp_path):
     small(tmp_path / "rgb" / "0.jpg")
     (tmp_path / "metadata.json").write_text(json.dumps({"poses": [], "K": []}))
-    assert "an export of Record3D" in found(tmp_path / "rgb")[1]
-    assert "an export of Record3D" in found(tmp_path)[1]
+    assert_facts(found(tmp_path / "rgb")[1], "Record3D")
+    assert_facts(found(tmp_path)[1], "Record3D")
 
 
 def test_the_icon_of_a_recording_is_not_a_photo_of_it(tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 import fake_stages
 import pytest
+from facts import assert_facts
 from fake_stages import NAMES
 
 from recon_cli import __version__
@@ -51,7 +52,7 @@ def test_each_verb_runs_its_stage_and_says_what_came_of_it(capsys: Said) -> None
     assert fake_stages.ran == NAMES
     out = capsys.readouterr().out
     assert "train (" in out
-    assert "the table of evaluate" in out
+    assert_facts(out, "table", "evaluate")
     assert main(["train"]) == 0
     assert capsys.readouterr().out == "train is up to date\n"
     assert main(["train", "--again"]) == 0
@@ -126,7 +127,7 @@ def test_train_prune_branches_off_in_the_middle() -> None:
 
 def test_pruning_options_without_prune_are_a_usage_error(capsys: Said) -> None:
     assert main(["train", "--ratio", "0.25"]) == 2
-    assert "--ratio has no effect without --prune" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "--ratio", "--prune")
 
 
 def test_the_layers_win_in_order_defaults_toml_config_options() -> None:
@@ -171,7 +172,7 @@ def test_status_shows_state_and_reason(capsys: Said) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[1:]] == [*NAMES, PAGE]
     assert "fresh" in lines[1]
-    assert "train.iterations changed: automatic -> 7" in lines[1 + NAMES.index("train")]
+    assert_facts(lines[1 + NAMES.index("train")], "train.iterations", 7)
 
 
 def test_status_as_json_has_stable_keys(capsys: Said) -> None:
@@ -197,7 +198,7 @@ def test_status_says_that_an_input_is_gone(capsys: Said) -> None:
     main(["ingest", "room.mp4"])
     Path("room.mp4").unlink()
     assert main(["status"]) == 0
-    assert "room.mp4 is gone" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "room.mp4")
 
 
 def test_a_missing_stage_is_4_and_names_the_command(capsys: Said) -> None:
@@ -209,7 +210,7 @@ def test_a_missing_stage_is_4_and_names_the_command(capsys: Said) -> None:
 
 def test_a_missing_input_is_3(capsys: Said) -> None:
     assert main(["ingest", "none.mp4"]) == 3
-    assert "none.mp4 does not exist" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "none.mp4")
 
 
 @pytest.mark.parametrize("words", [
@@ -227,14 +228,14 @@ def test_a_recon_toml_that_leads_nowhere_is_2_and_not_passed_over(capsys: Said) 
     Path("workspace").mkdir()
     Path("workspace/recon.toml").symlink_to("gone.toml")
     assert main(["status"]) == 2
-    assert "recon.toml cannot be read" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "recon.toml")
 
 
 def test_an_unknown_key_in_recon_toml_is_2(capsys: Said) -> None:
     Path("workspace").mkdir()
     Path("workspace/recon.toml").write_text("[train]\niteration = 3\n")
     assert main(["status"]) == 2
-    assert "Did you mean iterations?" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "mean", "iterations")
 
 
 def test_a_broken_manifest_is_7(capsys: Said) -> None:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from facts import assert_facts, raises
 
 import recon_cli
 from recon_cli.cli import main
@@ -66,7 +67,7 @@ def test_what_a_verb_does_not_take_is_answered_by_the_command_that_does(
 
 
 def test_an_address_is_refused_from_python_as_well(tmp_path):
-    with pytest.raises(ConfigError, match=r"https://a\.org/room\.mp4"):
+    with raises(ConfigError, "https://a.org/room.mp4"):
         recon_cli.Workspace(tmp_path / "ws").ingest("https://a.org/room.mp4")
     assert not (tmp_path / "ws").exists()
 
@@ -153,7 +154,7 @@ def test_an_option_of_a_stage_is_answered_by_its_set(capsys):
     assert main(["run", "x", "--iterations", "5"]) == 2
     assert "--set train.iterations=VALUE" in said(capsys)[1]
     assert main(["run", "x", "--seed", "5"]) == 2
-    assert "--set sfm.seed=VALUE or --set train.seed=VALUE" in said(capsys)[1]
+    assert_facts(said(capsys)[1], "--set", "sfm.seed=VALUE", "train.seed=VALUE")
 
 
 def test_run_takes_the_options_that_first_users_look_for(capsys, tmp_path):

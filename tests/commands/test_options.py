@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from facts import raises
 
 from recon_cli.cli import cli
 from recon_cli.commands import options
@@ -154,7 +155,7 @@ def test_a_format_that_is_not_typed_leaves_the_setting_alone(tmp_path: Path) -> 
 
 
 def test_an_empty_format_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"compressed\.ply"):
+    with raises(ConfigError, "compressed.ply"):
         ExportConfig(**parsed(ExportConfig, "--format", "spz", "--format", ""))  # type: ignore[arg-type]
 
 

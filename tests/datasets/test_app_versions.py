@@ -10,6 +10,7 @@ import struct
 
 import numpy as np
 import pytest
+from facts import assert_facts
 from plain_captures import (
     COUNT,
     CX,
@@ -366,7 +367,7 @@ def test_quest_in_unitys_axes(tmp_path):
     assert len(posed.images) == 2 * COUNT
     rgb = posed.images[0].read()
     assert (rgb[0, 0, 0], rgb[-1, 0, 0]) == (200, 50)
-    assert any("2 frames that the headset says failed" in notice for notice in posed.notices)
+    assert_facts("\n".join(posed.notices), 2, "frames", "headset")
 
 
 def test_a_packed_stream_of_another_shape_than_its_photo_is_refused(tmp_path):

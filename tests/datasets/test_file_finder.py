@@ -2,6 +2,7 @@
 
 import posed_sets
 import pytest
+from facts import raises
 
 from recon_cli.datasets.file_finder import FileFinder
 from recon_cli.errors import FormatError
@@ -53,5 +54,5 @@ def test_a_mask_or_a_depth_map_stands_for_no_image(tmp_path):
 
 
 def test_a_name_that_leads_out_is_refused_where_nothing_is_called_so(tmp_path):
-    with pytest.raises(FormatError, match="lies outside"):
+    with raises(FormatError, "lies", "outside"):
         FileFinder(tmp_path, ["../a.png"]).find("../a.png", "list")

@@ -3,6 +3,7 @@ import json
 import posed_sets
 import pytest
 from app_sets import APPS
+from facts import assert_facts, raises
 
 from recon_cli.datasets.layouts import LAYOUTS, describe, read_posed, recognise, refuse_incomplete
 from recon_cli.errors import FormatError, InputError
@@ -48,15 +49,15 @@ def test_a_layout_is_recognised_read_and_described(tmp_path, name):
 def test_missing_images_are_described(tmp_path):
     posed_sets.make_transforms(tmp_path)
     (tmp_path / "images" / "0000.png").unlink()
-    assert describe(read_posed(tmp_path)).endswith(": 3 images, 1 image missing")
+    assert_facts(describe(read_posed(tmp_path)), 3, 1, "images", "missing")
 
 
 def test_recognition_opens_nothing(tmp_path):
     (tmp_path / "transforms.json").write_text("{ broken")
     assert recognise(tmp_path) == "transforms"
-    with pytest.raises(FormatError, match="cannot be read as JSON") as refused:
+    with raises(FormatError, "JSON") as refused:
         read_posed(tmp_path)
-    assert "Export it again" in refused.value.hint
+    assert_facts(refused.value.hint, "Export", "again")
 
 
 @pytest.mark.parametrize(("make", "lost", "message"), [
@@ -76,7 +77,7 @@ def test_frames_of_7_scenes_without_poses_are_not_taken_for_photos(tmp_path):
     posed_sets.make_seven_scenes(tmp_path)
     for path in tmp_path.glob("*.pose.txt"):
         path.unlink()
-    with pytest.raises(FormatError, match="a 7-Scenes sequence without frame") as refused:
+    with raises(FormatError, "7-Scenes") as refused:
         refuse_incomplete(tmp_path)
     assert "frame-*.color.*" in refused.value.hint
 
@@ -86,7 +87,7 @@ def test_photos_and_videos_have_no_layout(tmp_path):
     assert recognise(tmp_path) is None
     assert recognise(tmp_path / "photo.jpg") is None
     assert recognise(tmp_path / "gone") is None
-    with pytest.raises(InputError, match="not a data set with poses") as caught:
+    with raises(InputError, "data", "poses") as caught:
         read_posed(tmp_path)
     assert all(layout.needs in caught.value.hint for layout in LAYOUTS)
 

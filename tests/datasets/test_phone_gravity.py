@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from app_shots import ARKIT, shots
+from facts import assert_facts, raises
 from phone_writers import stray
 
 from recon_cli.datasets.layouts import read_posed
@@ -59,7 +60,7 @@ def test_other_units_other_times_and_other_columns_say_nothing(tmp_path):
     assert read_gravity(path, [time + 100 for time in TIMES], views) is None
     assert read_gravity(write(path, []), TIMES, views) is None
     path.write_text(path.read_text().replace("a_x", "b"))
-    with pytest.raises(FormatError, match="lacks the columns a_x"):
+    with raises(FormatError, "a_x"):
         read_gravity(path, TIMES, views)
 
 
@@ -101,7 +102,7 @@ def test_a_tilted_world_gets_its_up_from_the_accelerometer(taken, tmp_path):
     record(tmp_path, taken, tilt)
     posed = read_posed(tmp_path)
     np.testing.assert_allclose(posed.up, tilt[:3, 1], atol=0.02)
-    assert any("29 degrees off the y axis" in notice for notice in posed.notices)
+    assert_facts("\n".join(posed.notices), 29, "degrees", "axis")
 
 
 def test_accelerations_of_another_recording_change_nothing(taken, tmp_path):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.errors import FormatError
 from recon_cli.workspace.records import POINTS, POSES, KnownPoses, read_poses
@@ -31,5 +32,5 @@ def test_points_that_are_gone_or_cut_off_are_refused(tmp_path, spoil):
         (tmp_path / POINTS).unlink()
     else:
         (tmp_path / POINTS).write_bytes((tmp_path / POINTS).read_bytes()[:-1])
-    with pytest.raises(FormatError, match=r"poses\.json"):
+    with raises(FormatError, "poses.json"):
         read_poses(tmp_path / POSES)

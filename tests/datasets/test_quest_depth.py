@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from app_shots import ARKIT, cut, quat, shots
+from facts import assert_facts
 from phone_writers import quest
 
 from recon_cli.datasets.layouts import read_posed
@@ -76,7 +77,7 @@ def test_depth_of_a_walk_without_motion_is_left(photos, depths, tmp_path):
     write_depth(tmp_path, depths[:1])
     posed = read_posed(tmp_path)
     assert not any(image.depth for image in posed.images)
-    assert any("depth is not read of 3 frames" in notice for notice in posed.notices)
+    assert_facts("\n".join(posed.notices), 3, "depth", "frames")
 
 
 def test_depth_of_another_time_is_left(photos, depths, tmp_path):
@@ -84,7 +85,7 @@ def test_depth_of_another_time_is_left(photos, depths, tmp_path):
     write_depth(tmp_path, depths, late_ms=100_000)
     posed = read_posed(tmp_path)
     assert not any(image.depth for image in posed.images)
-    assert any("depth is not read of 20 frames" in notice for notice in posed.notices)
+    assert_facts("\n".join(posed.notices), 20, "depth", "frames")
 
 
 def test_rows_without_a_camera_and_files_cut_short_are_counted(photos, depths, tmp_path):
@@ -95,7 +96,7 @@ def test_rows_without_a_camera_and_files_cut_short_are_counted(photos, depths, t
     path.write_text("\n".join([*lines[:-1], lines[-1][:30]]))
     posed = read_posed(tmp_path)
     assert sum(image.depth is not None for image in posed.images) == len(photos) - 1
-    assert any("1 frame of depth without a camera" in notice for notice in posed.notices)
+    assert_facts("\n".join(posed.notices), 1, "frame", "camera")
     short = next((tmp_path / "left_depth").iterdir())
     short.write_bytes(short.read_bytes()[:-4])
     assert not any(image.depth for image in read_posed(tmp_path).images)

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import posed_sets
 import pytest
+from facts import raises
 
 from recon_cli.datasets.rgbd import is_replica, read_replica
 from recon_cli.errors import FormatError, InputError
@@ -64,7 +65,7 @@ def test_without_a_test_folder_nothing_is_held_out(tmp_path):
 
 def test_novel_views_without_poses_are_not_left_out_in_silence(folder):
     (folder / "test" / "traj.txt").unlink()
-    with pytest.raises(FormatError, match=r"test.traj\.txt is missing"):
+    with raises(FormatError, "test/traj.txt"):
         read_replica(folder)
 
 
@@ -80,7 +81,7 @@ def test_frames_left_out_in_between_are_missing_and_the_others_keep_their_poses(
 def test_a_trajectory_of_another_length_is_refused_with_both_numbers(folder, rows):
     lines = (folder / "traj.txt").read_text().splitlines()
     (folder / "traj.txt").write_text("\n".join([*lines, lines[0]][:rows]) + "\n")
-    with pytest.raises(FormatError, match=f"has {rows} poses, but the 4 frames"):
+    with raises(FormatError, rows, 4, "frames"):
         read_replica(folder)
 
 
@@ -99,7 +100,7 @@ def test_a_damaged_line_of_the_trajectory_is_named(folder, edit, said):
 
 def test_missing_camera_parameters_are_asked_for_with_an_example(folder):
     (folder / "cam_params.json").unlink()
-    with pytest.raises(FormatError, match=r"has no cam_params\.json") as caught:
+    with raises(FormatError, "cam_params.json") as caught:
         read_replica(folder)
     assert '"scale": 6553.5' in caught.value.hint
 
@@ -110,7 +111,7 @@ def test_missing_camera_parameters_are_asked_for_with_an_example(folder):
     {"camera": {"w": 32, "h": 24, "fx": "nan", "fy": 1, "cx": 1, "cy": 1, "scale": 1}}])
 def test_camera_parameters_that_are_none_are_refused(folder, value):
     (folder / "cam_params.json").write_text(json.dumps(value))
-    with pytest.raises(FormatError, match="cam_params"):
+    with raises(FormatError, "cam_params"):
         read_replica(folder)
 
 
@@ -119,7 +120,7 @@ def test_a_folder_without_frames_is_refused(tmp_path):
     for path in (tmp_path / "results").iterdir():
         path.unlink()
     assert is_replica(tmp_path)
-    with pytest.raises(InputError, match="holds no frame000000"):
+    with raises(InputError, "frame000000"):
         read_replica(tmp_path)
 
 
@@ -128,13 +129,13 @@ def test_a_depth_file_cut_short_anywhere_is_refused_when_it_is_read(folder, shar
     path = folder / "results" / "depth000000.png"
     data = path.read_bytes()
     path.write_bytes(data[:int(share * len(data))])
-    with pytest.raises(FormatError, match="cannot be read as depth"):
+    with raises(FormatError, "depth"):
         read_replica(folder).images[0].depth()
 
 
 def test_a_depth_file_of_colours_is_refused(folder):
     posed_sets.write_image(folder / "results" / "depth000000.png")
-    with pytest.raises(FormatError, match=r"shape \(24, 32, 3\), needed one value a pixel"):
+    with raises(FormatError, 24, 32, 3, "shape"):
         read_replica(folder).images[0].depth()
 
 

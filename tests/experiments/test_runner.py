@@ -7,6 +7,7 @@ import itertools
 from pathlib import Path
 
 import pytest
+from facts import raises
 from posed_sets import make_replica
 from tiny_scene import make_inputs
 
@@ -100,5 +101,5 @@ def test_a_digest_is_of_what_a_scene_holds(tmp_path: Path) -> None:
 def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
     for parent in ("a", "b"):
         make_replica(tmp_path / parent / "room")
-    with pytest.raises(ConfigError, match="both called room"):
+    with raises(ConfigError, "both", "called"):
         check_scenes([tmp_path / "a" / "room", tmp_path / "b" / "room"])

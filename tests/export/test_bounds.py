@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from facts import assert_facts
 from tiny_stages import CONTEXT
 
 from recon_cli.export.bounds import SPHERES, Room, bound_scene, describe_bounds, describe_loss
@@ -34,15 +35,15 @@ def test_a_scene_that_is_all_room_needs_no_word():
 
 def test_a_backdrop_is_named_with_the_option_that_leaves_it_out():
     text = describe_bounds(room(backdrop=BACKDROP))
-    assert "nine tenths of the Gaussians lie between 0 0 0 and 9 9 9" in text
+    assert_facts(text, 0, 9, "Gaussians", "between")
     assert "--backdrop drop" in text
-    assert "(9 units are left)" in text
+    assert_facts(text, 9, "units", "left")
     assert "--crop" not in text
 
 
 def test_gaussians_far_away_are_a_matter_of_crop():
     text = describe_bounds(room(far=3))
-    assert "reach 1,000 units" in text
+    assert_facts(text, "1,000")
     assert "--crop" in text
     assert "--backdrop drop" not in text
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from facts import raises
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
@@ -99,5 +100,5 @@ def test_the_loss_is_that_of_a_scene_which_is_30_db_from_its_photos():
 def test_a_scene_that_nobody_sees_is_refused():
     clear = gaussians(shell(), opacity=0.002)
     scene = synthetic_scene(clear, up=Z_UP, max_size=60)
-    with pytest.raises(ReconstructionError, match="sees anything"):
+    with raises(ReconstructionError, "sees", "anything"):
         SelfPsnr.from_renders(clear, cameras_of(scene), CONTEXT)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from facts import assert_facts, raises
 
 from recon_cli.errors import FormatError
 from recon_cli.flythrough.camera_path import CameraPath, read_camera_path, write_camera_path
@@ -85,7 +86,7 @@ def test_the_pace_may_be_said_by_the_seconds_or_not_at_all(tmp_path):
 
 def test_a_crop_is_left_out_with_a_word(tmp_path, caplog):
     read(tmp_path, value(crop={"crop_center": [0, 0, 0]}))
-    assert "crop is ignored" in caplog.text
+    assert_facts(caplog.text, "crop", "ignored")
 
 
 SCALED = [2 * one if at < 12 and at % 4 < 3 else one for at, one in enumerate(POSE)]
@@ -125,5 +126,5 @@ def test_a_file_that_is_no_camera_path_is_refused_with_the_reason(tmp_path, cont
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="cannot be read"):
+    with raises(FormatError):
         read_camera_path(tmp_path / "none.json")

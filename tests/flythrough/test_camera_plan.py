@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.errors import ConfigError
 from recon_cli.flythrough import camera_plan
@@ -86,10 +87,10 @@ def test_views_keep_their_own_lens():
 
 def test_a_frame_without_a_camera_and_a_part_without_views_are_said():
     whole = trained()
-    with pytest.raises(ConfigError, match="has no camera"):
+    with raises(ConfigError, "camera"):
         plan_cameras(RenderRequest(views=("099.png",)), whole)
     none = replace(whole, scene=replace(whole.scene, validation=()))
-    with pytest.raises(ConfigError, match="no validation views"):
+    with raises(ConfigError, "validation", "views"):
         plan_cameras(RenderRequest(views=("validation",)), none)
 
 
@@ -110,18 +111,18 @@ def test_a_side_that_is_not_given_follows_and_is_even_in_a_video(options, own, e
 
 @pytest.mark.parametrize("options", [{"width": 301}, {"height": 301}, {"size": 301}])
 def test_an_odd_side_of_a_video_is_refused(options):
-    with pytest.raises(ConfigError, match="301"):
+    with raises(ConfigError, 301):
         frame_size(600, 400, RenderRequest(form="mp4", **options))
 
 
 def test_a_frame_that_does_not_fit_is_refused_with_the_memory_it_takes(monkeypatch):
     monkeypatch.setattr(camera_plan, "free_memory_bytes", lambda: 1_000_000_000)
     check_frame_memory(1920, 1080)
-    with pytest.raises(ConfigError, match=r"100000x56250 pixels takes about 562,500 MB.*1,000 MB"):
+    with raises(ConfigError, "100000x56250", "562,500", "MB", "1,000"):
         check_frame_memory(100_000, 56_250)
 
 
 def test_a_side_beyond_all_formats_is_refused_however_much_memory_there_is(monkeypatch):
     monkeypatch.setattr(camera_plan, "free_memory_bytes", lambda: 1 << 60)
-    with pytest.raises(ConfigError, match="65,536 pixels"):
+    with raises(ConfigError, "65,536"):
         check_frame_memory(100_000, 2)

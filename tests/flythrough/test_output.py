@@ -6,6 +6,7 @@ import av
 import numpy as np
 import pytest
 import torch
+from facts import raises
 from prepared_workspace import wall
 
 from recon_cli.errors import ConfigError, FormatError
@@ -179,14 +180,14 @@ def test_a_smaller_crf_is_closer(pictures, tmp_path):
 
 def test_a_codec_that_this_build_lacks_is_refused(monkeypatch):
     monkeypatch.setitem(output.ENCODERS, "h264", ("libnone",))
-    with pytest.raises(ConfigError, match=r"cannot encode h264: it lacks libnone") as caught:
+    with raises(ConfigError, "h264") as caught:
         check_encoding(VideoEncoding("h264", 18, 64, 48, 30))
     assert "av1" in caught.value.hint
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1"])
 def test_a_size_that_no_encoder_takes_is_refused(codec):
-    with pytest.raises(ConfigError, match="40000x48 pixels"):
+    with raises(ConfigError, "40000x48"):
         check_encoding(VideoEncoding(codec, 18, 40_000, 48, 30))
 
 

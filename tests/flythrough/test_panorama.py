@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from facts import raises
 from render_cli import pictures, render
 
 from recon_cli.errors import ConfigError
@@ -59,6 +60,6 @@ def test_a_view_and_a_path_are_rendered_all_around(room, tmp_path):
 
 
 def test_a_panorama_is_twice_as_wide_as_high():
-    with pytest.raises(ConfigError, match="twice as wide as high"):
+    with raises(ConfigError, "wide", "high"):
         RenderRequest(panorama=True, width=100, height=100)
     RenderRequest(panorama=True, width=200, height=100)

@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from facts import assert_facts
 from render_cli import SHORT, pictures, record, render, times
 
 from recon_cli.cli import main
@@ -124,7 +125,7 @@ def test_only_what_is_missing_is_rendered_again(room, tmp_path, capsys):
     (tmp_path / "out" / "rgb" / ".00001.png.tmp99.png").write_text("half")
     capsys.readouterr()
     assert render(room, *words) == 0
-    assert "2 of them rendered now" in capsys.readouterr().out
+    assert_facts(capsys.readouterr().out, 2, "rendered")
     after = times(tmp_path / "out")
     assert {name for name in after if after[name] != before[name]} == {"00001.png", "00003.png"}
     assert (tmp_path / "out" / "rgb" / "00001.png").read_bytes() == content
@@ -150,7 +151,7 @@ def test_a_frame_that_was_replaced_by_another_picture_is_kept_and_named(room, tm
     other = (folder / "00002.png").read_bytes()
     (folder / "00001.png").write_bytes(other)
     assert render(room, *words) == 0
-    assert "kept, though not as they were rendered" in caplog.text
+    assert_facts(caplog.text, "kept", "though", "rendered")
     assert "rgb/00001.png" in caplog.text
     assert (folder / "00001.png").read_bytes() == other
 
@@ -167,7 +168,7 @@ def test_other_settings_start_anew_and_are_named(room, tmp_path, caplog, change,
     before = times(tmp_path / "out")
     assert render(room, *words, *change) == 0
     [said_so] = [text for text in caplog.messages if "rendered again" in text]
-    assert said_so.endswith(f"because settings changed: {said}")
+    assert_facts(said_so, said, "settings", "changed")
     after = times(tmp_path / "out")
     assert not {name for name in after if after[name] == before[name]}
     assert pictures(tmp_path / "out", "alpha") == (
@@ -196,9 +197,9 @@ def test_ctrl_c_leaves_the_finished_frames_and_exits_with_130(
     with monkeypatch.context() as patch:
         patch.setattr(running, "render", interrupted)
         assert render(room, *words) == 130
-    assert "run the same command again" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "command", "again")
     assert pictures(tmp_path / "out") == ["00000.png", "00001.png"]
     assert not list(tmp_path.rglob("*.mp4"))
     assert render(room, *words) == 0
-    assert "2 of them rendered now" in capsys.readouterr().out
+    assert_facts(capsys.readouterr().out, 2, "rendered")
     assert (tmp_path / "out" / "rgb.mp4").exists()

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from facts import raises
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,7 +18,7 @@ def test_a_pose_is_inverted():
 def test_a_camera_beyond_all_coordinates_is_refused():
     far = POSE.copy()
     far[0, 3] = 1e30
-    with pytest.raises(FormatError, match=r"puts the camera at 1e\+30 3 4, out of range"):
+    with raises(FormatError, "1e+30", 3, 4):
         viewmat_from_pose(far, "it")
 
 
@@ -44,16 +45,16 @@ def test_a_rounded_rotation_is_made_orthonormal():
 def test_a_scaled_pose_is_refused_with_its_scale(angle, scale):
     scaled = np.eye(4)
     scaled[:3, :3] = scale * turn(angle)
-    with pytest.raises(FormatError, match=f"frame 7 is not a rigid pose: scaled by {scale:.4g}"):
+    with raises(FormatError, 7, f"{scale:.4g}", "scaled"):
         viewmat_from_pose(scaled, "frame 7")
 
 
 def test_a_reflection_and_a_shear_are_refused():
-    with pytest.raises(FormatError, match="a reflection"):
+    with raises(FormatError, "reflection"):
         viewmat_from_pose(np.diag([1.0, 1, -1, 1]), "it")
     sheared = np.eye(4)
     sheared[0, 1] = 0.1
-    with pytest.raises(FormatError, match="not at right angles"):
+    with raises(FormatError, "right", "angles"):
         viewmat_from_pose(sheared, "it")
 
 
@@ -72,7 +73,7 @@ def test_a_matrix_with_pixel_centres_at_whole_numbers_is_moved_by_half_a_pixel()
 
 
 def test_a_skewed_matrix_is_refused():
-    with pytest.raises(FormatError, match="skew"):
+    with raises(FormatError, "skew"):
         lens_from_matrix(
             np.array([[300.0, 9, 299.5], [0, 310, 169.5], [0, 0, 1]]), 600, 340, "K")
 

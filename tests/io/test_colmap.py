@@ -1,6 +1,7 @@
 import numpy as np
 import pycolmap
 import pytest
+from facts import raises
 from PIL import Image
 
 from recon_cli.errors import FormatError
@@ -135,7 +136,7 @@ def test_a_file_cut_short_anywhere_is_damaged(undistorted, name, share):
     path = undistorted / "sparse" / name
     data = path.read_bytes()
     path.write_bytes(data[:int(share * len(data))])
-    with pytest.raises(FormatError, match="not a complete COLMAP model"):
+    with raises(FormatError, "COLMAP"):
         read(undistorted)
 
 
@@ -143,7 +144,7 @@ def test_a_file_cut_short_anywhere_is_damaged(undistorted, name, share):
 def test_a_file_with_something_behind_its_end_is_damaged(undistorted, name):
     with (undistorted / "sparse" / name).open("ab") as file:
         file.write(b"\0")
-    with pytest.raises(FormatError, match="1 bytes too many"):
+    with raises(FormatError, 1, "bytes"):
         read(undistorted)
 
 
@@ -157,7 +158,7 @@ def test_a_file_of_noise_is_refused(undistorted, name):
 
 def test_a_distorted_camera_is_refused(undistorted):
     model(kind="OPENCV", params=(5, 5, 4, 3, 0, 0, 0, 0)).write(undistorted / "sparse")
-    with pytest.raises(FormatError, match="only undistorted pinhole"):
+    with raises(FormatError, "undistorted", "pinhole"):
         read(undistorted)
 
 
@@ -166,21 +167,21 @@ def test_a_model_without_points_is_refused(undistorted):
     for point in list(made.point3D_ids()):
         made.delete_point3D(point)
     made.write(undistorted / "sparse")
-    with pytest.raises(FormatError, match="0 points"):
+    with raises(FormatError, 0, "points"):
         read(undistorted)
 
 
 @pytest.mark.parametrize("folder", ["images", "denoised"])
 def test_a_missing_image_is_named(undistorted, folder):
     (undistorted / folder / NAMES[3]).unlink()
-    with pytest.raises(FormatError, match=f"{folder}.{NAMES[3]} is missing"):
+    with raises(FormatError, f"{folder}/{NAMES[3]}"):
         read(undistorted)
 
 
 @pytest.mark.parametrize("folder", ["images", "denoised"])
 def test_an_image_of_another_size_than_its_camera_is_refused(undistorted, folder):
     Image.new("RGB", (WIDTH + 1, HEIGHT)).save(undistorted / folder / NAMES[3])
-    with pytest.raises(FormatError, match="9x6 pixels, but its camera 8x6"):
+    with raises(FormatError, "9x6", "8x6"):
         read(undistorted)
 
 
@@ -199,7 +200,7 @@ def test_without_a_folder_of_masks_every_pixel_counts(undistorted):
 def test_a_mask_of_another_size_than_its_camera_is_refused(undistorted):
     (undistorted / "masks").mkdir()
     Image.new("L", (WIDTH, HEIGHT + 1)).save(undistorted / "masks" / NAMES[3])
-    with pytest.raises(FormatError, match=r"masks.*8x7 pixels, but its camera 8x6"):
+    with raises(FormatError, "8x7", "8x6"):
         read(undistorted)
 
 

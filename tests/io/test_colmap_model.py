@@ -1,4 +1,4 @@
-import pytest
+from facts import raises
 
 from recon_cli.errors import FormatError
 from recon_cli.io.colmap_model import read_points_text
@@ -12,7 +12,7 @@ def test_a_file_cut_between_two_lines_is_noticed_by_its_head(tmp_path):
     path.write_text(HEAD + "".join(ROWS))
     assert len(read_points_text(path)[0]) == 3
     path.write_text(HEAD + "".join(ROWS[:2]))
-    with pytest.raises(FormatError, match="ends after 2 of the 3 entries that line 2 promises"):
+    with raises(FormatError, 2, 3, "promises"):
         read_points_text(path)
 
 

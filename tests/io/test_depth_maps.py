@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.errors import FormatError
 from recon_cli.io.depth_maps import (
@@ -58,12 +59,12 @@ def test_a_damaged_list_is_refused(tmp_path, change):
     value = json.loads((tmp_path / LIST).read_text())
     value["a.png"] |= change
     (tmp_path / LIST).write_text(json.dumps(value))
-    with pytest.raises(FormatError, match="not a list of depth maps"):
+    with raises(FormatError, "list", "depth"):
         read_depth_list(tmp_path)
 
 
 def test_a_map_of_another_size_is_refused(tmp_path):
     record, *_ = stored(tmp_path, np.ones((3, 4)))
     write_depth(tmp_path, "a.png", np.ones((3, 5), np.float32), LENS)
-    with pytest.raises(FormatError, match="cannot be read as a depth map"):
+    with raises(FormatError, "depth"):
         read_depth(tmp_path, "a.png", record)

@@ -5,6 +5,7 @@ import os
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.errors import FormatError
 from recon_cli.io.images import (
@@ -84,7 +85,7 @@ def test_a_mask_that_ignores_everything_leaves_nothing(tmp_path):
 
 def test_a_file_that_is_no_mask_is_named(tmp_path):
     (tmp_path / "m.png").write_text("no picture")
-    with pytest.raises(FormatError, match=r"m\.png cannot be read as a mask"):
+    with raises(FormatError, "m.png"):
         read_mask(tmp_path / "m.png", 4, 1)
 
 
@@ -121,6 +122,6 @@ def test_what_is_missing_empty_or_no_image_is_a_typed_error(tmp_path, data):
     if data is not None:
         path.write_bytes(data)
     for read in (read_png, lambda path: read_image(path, 6, 4)):
-        with pytest.raises(FormatError, match="cannot be read") as raised:
+        with raises(FormatError) as raised:
             read(path)
         assert raised.value.hint

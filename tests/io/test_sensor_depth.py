@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import assert_facts
 
 from recon_cli.io.depth_maps import write_depth, write_depth_list
 from recon_cli.io.sensor_depth import LEAST_NOISE, read_sensor_depth
@@ -124,7 +125,7 @@ def test_rows_in_the_wrong_order_are_refused(scene):
     write(scene, tilted)
     sensor = read_sensor_depth(scene)
     assert not sensor.depths
-    assert "differs from the points of the model" in sensor.refused
+    assert_facts(sensor.refused, "differs", "points")
 
 
 def test_a_view_with_the_depth_of_another_moment_is_left_out(scene):
@@ -139,7 +140,7 @@ def test_too_few_points_say_nothing_about_the_sensor(scene):
     few = Scene(scene.train, (), (), (), scene.points[:5], scene.colors[:5], depth=scene.depth)
     sensor = read_sensor_depth(few)
     assert not sensor.depths
-    assert "points of the model show how it fits" in sensor.refused
+    assert_facts(sensor.refused, "points", "model")
 
 
 def test_a_scene_without_depth_has_none_and_nothing_to_say(scene):

@@ -1,6 +1,7 @@
 import dataclasses
 
 import pytest
+from facts import assert_facts
 
 from recon_cli.errors import BackendError
 from recon_cli.jobs.executor import Command
@@ -85,4 +86,4 @@ def test_failures_are_counted_and_named():
     failed = {str(index): "It is dark." for index in range(7)}
     assert describe_failures({"a": "It is dark."}, 3, "rooms") == (
         "1 of 3 rooms failed (a: It is dark).")
-    assert describe_failures(failed, 9, "rooms").endswith("4: It is dark and 2 more).")
+    assert_facts(describe_failures(failed, 9, "rooms"), 4, 2, "dark")

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from facts import raises
 from fake_stages import NAMES, TABLE, bring, job_at, stale
 
 from recon_cli.errors import StageError
@@ -50,7 +51,7 @@ def test_prune_without_the_states_names_the_command_that_makes_them(full: Job) -
     free_space(full, states=True)
     before = bring(full, "evaluate")
     assert before == []  # nothing else needs them
-    with pytest.raises(StageError, match=r"prune starts from train/step5\.txt"):
+    with raises(StageError, "train/step5.txt"):
         plan_prune(full)
     bring(full, "train", again=True)  # the hint, typed
     plan_prune(full)
@@ -89,7 +90,7 @@ def test_all_but_the_exports_can_go(full: Job) -> None:
 
 def test_without_an_export_nothing_is_removed_for_it(full: Job) -> None:
     free_space(full, ["export"])
-    with pytest.raises(StageError, match="no exported scene to keep"):
+    with raises(StageError, "exported", "scene"):
         free_space(full, keep_exports=True)
     assert full.workspace.folder("train").exists()
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from facts import assert_facts
 from fake_stages import TABLE
 from numba_runs import copy_cache
 
@@ -86,7 +87,7 @@ def test_a_failure_goes_to_the_log_and_not_to_the_terminal(tmp_path, worker, cap
     with (caplog.at_level(logging.DEBUG, "recon"),
           compile_ahead.compile_ahead(job_in(tmp_path), ["ingest", "train"], again=False)):
         assert children(alive=False)
-    assert "ended with 3: out of memory" in caplog.text
+    assert_facts(caplog.text, 3, "ended", "memory")
     assert all(record.levelno == logging.DEBUG for record in caplog.records)
     assert capfd.readouterr() == ("", "")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import fake_stages
 import pytest
-from facts import assert_facts
+from facts import assert_facts, raises
 from fake_stages import NAMES, STEPS, bring, job_at, stale
 
 from recon_cli.commands.workspace import status_table
@@ -82,9 +82,9 @@ def test_a_stage_keeps_the_options_it_was_made_with_when_others_need_it(job: Job
 def test_explicit_settings_win_over_what_a_stage_was_made_with(job: Job) -> None:
     bring(job, "train", changes={"train": {"iterations": 100, "seed": 3}})
     set_now = job_at(job.workspace.root, {"train": {"iterations": 200}})
-    with pytest.raises(StageError, match=r"train\.iterations changed: 100 -> 200") as caught:
+    with raises(StageError, "train.iterations", 100, 200) as caught:
         bring(set_now, "evaluate")
-    assert caught.value.hint == "Run `recon train --seed 3` first."
+    assert_facts(caught.value.hint, "recon train --seed 3")
 
 
 def test_a_verb_does_the_same_whatever_was_typed_before(job: Job) -> None:
@@ -114,7 +114,7 @@ def test_a_missing_stage_makes_those_behind_it_stale_only_if_it_comes_out_otherw
     assert bring(job, "evaluate", changes={"evaluate": {"max_size": 50}}) == ["place", "evaluate"]
     shutil.rmtree(job.workspace.folder("place"))
     other: Settings = {"sfm": {"max_features": 999}}
-    with pytest.raises(StageError, match="eval needs train, which is stale: place's output cha"):
+    with raises(StageError, "train", "output"):
         bring(job_at(job.workspace.root, other), "evaluate", again=True)
 
 
@@ -166,7 +166,7 @@ def test_a_failure_keeps_the_old_result_and_everything_finished_before(job: Job)
 
     fake_stages.actions["train"] = fail
     changes: Settings = {"sfm": {"max_features": 500}, "train": {"iterations": 9}}
-    with pytest.raises(WorkspaceError, match="MB free"):
+    with raises(WorkspaceError, "MB", "free"):
         bring(job, "sfm", "train", changes=changes)
     assert written(job, "train") == before
     assert "sfm" not in stale(job)
@@ -187,7 +187,7 @@ def test_a_workspace_that_is_renamed_in_mid_run_is_continued_at_its_new_place(
             raise failure
 
     fake_stages.actions[name] = rename
-    with pytest.raises(WorkspaceError, match="renamed or deleted") as caught:
+    with raises(WorkspaceError, "renamed", "deleted") as caught:
         bring(job, name, video=video if new else None, again=True)
     assert "-w" in caught.value.hint
     assert not job.workspace.root.exists()
@@ -227,10 +227,10 @@ def test_an_interrupted_run_is_partial_until_what_it_reads_changes(job: Job) -> 
     shutil.rmtree(job.workspace.folder("train"))
     one = plan.status(job)[4]
     assert (one.state, one.done, one.total) == ("partial", 0, 0)
-    assert "partial (just begun)" in status_table([one])
-    with pytest.raises(StageError, match=r"unfinished \(just begun\)") as caught:
+    assert_facts(status_table([one]), "partial", "just", "begun")
+    with raises(StageError, "unfinished", "begun") as caught:
         bring(job, "prune", again=True)
-    assert caught.value.hint == "Run `recon train --iterations 100` first."
+    assert_facts(caught.value.hint, "recon train --iterations 100")
     bring(job, "sfm", "place", changes={"sfm": {"max_features": 500}})
     assert plan.status(job)[4].state == "missing"
 
@@ -246,7 +246,7 @@ def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) ->
         while plan.status(job)[4].done < 2:
             assert time.monotonic() - started < 60
             time.sleep(0.05)
-        with pytest.raises(WorkspaceError, match=f"process {process.pid}") as caught:
+        with raises(WorkspaceError, process.pid, "process") as caught:
             bring(job, "train")
         assert caught.value.exit_code == 7
     finally:

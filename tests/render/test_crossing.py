@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from facts import raises
 from oracle import composited
 from scenes import camera_at, joined, one_splat, random_splats
 
@@ -55,7 +56,7 @@ def test_what_is_half_covered_has_no_median(backend, dtype):
 
 def test_a_backend_that_is_none_is_refused():
     splats = one_splat((0.0, 0.0, 2.0), scale=5.0, opacity=0.4, color=(1, 0, 0))
-    with pytest.raises(BackendError, match="backend"):
+    with raises(BackendError, "backend"):
         find_crossing(splats, camera_at(), backend="cuda")
 
 

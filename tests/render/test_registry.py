@@ -4,6 +4,7 @@ import importlib.util
 
 import pytest
 import torch
+from facts import assert_facts, raises
 
 from recon_cli.errors import BackendError
 from recon_cli.render import resolve, self_check
@@ -18,7 +19,7 @@ def test_auto_names_what_will_run():
 
 
 def test_a_backend_that_does_not_exist_is_refused():
-    with pytest.raises(BackendError, match="backend"):
+    with raises(BackendError, "backend"):
         resolve("vulkan", "cpu")
 
 
@@ -45,7 +46,7 @@ def test_auto_says_why_torch_is_used_in_place_of_triton(monkeypatch, caplog, the
     on_a_gpu(monkeypatch, **there)
     with caplog.at_level("WARNING", "recon"):
         assert resolve("auto", "cuda") == ("torch", "cuda")
-    assert "torch is used in place of triton" in caplog.text
+    assert_facts(caplog.text, "torch", "place", "triton")
     assert reason in caplog.text
     with pytest.raises(BackendError, match=reason):
         resolve("triton", "cuda")
@@ -55,7 +56,7 @@ def test_auto_takes_torch_where_the_triton_kernels_fail_on_this_gpu(monkeypatch,
     on_a_gpu(monkeypatch, failure=FAILURE)
     with caplog.at_level("WARNING", "recon"):
         assert resolve("auto", "auto") == ("torch", "cuda")
-    assert "torch is used in place of triton" in caplog.text
+    assert_facts(caplog.text, "torch", "place", "triton")
     assert FAILURE in caplog.text
     assert not cuda_verdict().passed
 
@@ -64,7 +65,7 @@ def test_triton_by_name_runs_where_it_fails_with_a_warning(monkeypatch, caplog):
     on_a_gpu(monkeypatch, failure=FAILURE)
     with caplog.at_level("WARNING", "recon"):
         assert resolve("triton", "cuda") == ("triton", "cuda")
-    assert "results may be wrong" in caplog.text
+    assert_facts(caplog.text, "results", "wrong")
     assert FAILURE in caplog.text
     caplog.clear()
     on_a_gpu(monkeypatch)
@@ -84,6 +85,6 @@ def test_triton_is_refused_on_the_cpu():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
 def test_cuda_is_refused_where_there_is_none_instead_of_using_the_cpu():
-    with pytest.raises(BackendError, match="CUDA") as caught:
+    with raises(BackendError, "CUDA") as caught:
         resolve("torch", "cuda")
     assert caught.value.exit_code == 6

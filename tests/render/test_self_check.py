@@ -5,6 +5,7 @@ import json
 
 import pytest
 import torch
+from facts import raises
 from interpreter import DEVICE
 
 from recon_cli.errors import BackendError
@@ -215,7 +216,7 @@ def test_a_fault_that_spoils_cuda_for_the_process_is_kept_and_tells_to_run_again
         raise RuntimeError("CUDA error: an illegal memory access was encountered")
 
     monkeypatch.setattr(torch, "zeros", broken)
-    with pytest.raises(BackendError, match="cannot be used by this process") as caught:
+    with raises(BackendError, "process") as caught:
         self_check._require_usable(torch.device("cuda"), FAILED)
     assert "again" in caught.value.hint
     self_check._require_usable(torch.device("cuda"), PASSED)

@@ -75,6 +75,17 @@ def test_more_is_further_right_and_higher():
     assert y1 - y2 == pytest.approx(y2 - y3, abs=0.2)
 
 
+def test_a_point_lies_on_the_lines_of_its_ticks():
+    figure = draw_chart("t", X, Y, [Series("a", ((0, 0), (10, 10)), mark="circle")])
+    lines = [{name: float(value) for name, value in re.findall(r'(\w+)="([-\d.]+)"', line)}
+             for line in re.findall(r'<line class="grid"[^>]*>', figure)]
+    lowest = max(line["y1"] for line in lines if line["y1"] == line["y2"])
+    first = min(line["x1"] for line in lines if line["x1"] == line["x2"])
+    (x, y), _ = marks(figure)
+    assert y == pytest.approx(lowest, abs=0.1)
+    assert x + 3.5 == pytest.approx(first, abs=0.1)  # its path begins a radius to the left
+
+
 def test_decades_are_equally_far_apart_on_a_logarithmic_axis():
     figure = draw_chart("t", Axis("s", log=True), Y, [
         Series("a", ((0, 5), (1, 10), (10, 20), (100, 30)), mark="circle")])

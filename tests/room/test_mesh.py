@@ -6,6 +6,7 @@ import copy
 
 import numpy as np
 import pytest
+from facts import assert_facts, raises
 from tiny_stages import CONTEXT
 
 from recon_cli.errors import ReconstructionError
@@ -115,9 +116,9 @@ def test_a_mesh_that_does_not_fit_gets_coarser_voxels_with_a_notice(monkeypatch)
     monkeypatch.setattr(build, "_MOST_BYTES", fine / 3)
     result = mesh_of(maps, None, ctx, max_triangles=10**6, voxel=0.02)
     assert 0.02 < result.voxel < 0.08
-    assert any("in place of 0.02" in text for text in notices)
+    assert_facts("\n".join(notices), "0.02")
     monkeypatch.setattr(build, "_MOST_BYTES", 10)
-    with pytest.raises(ReconstructionError, match="memory"):
+    with raises(ReconstructionError, "memory"):
         mesh_of(maps_of(FRONT, wall_depth), None, ctx, max_triangles=100, voxel=0.02)
 
 
@@ -126,5 +127,5 @@ def test_views_that_do_not_agree_make_no_mesh():
         rng = np.random.default_rng(int(1e6 * abs(view.center[1] + 3 * view.center[2])))
         return rng.uniform(0.5, 8.0, (view.height, view.width)).astype(np.float32)
 
-    with pytest.raises(ReconstructionError, match="There is no surface"):
+    with raises(ReconstructionError, "surface"):
         mesh_of(maps_of(FRONT[:2], random_depth), None, CONTEXT, max_triangles=1000, voxel=0.04)

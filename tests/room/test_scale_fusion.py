@@ -1,6 +1,7 @@
 import math
 
 import pytest
+from facts import assert_facts
 
 from recon_cli.room.scale_fusion import ScaleSource, fuse
 
@@ -12,7 +13,7 @@ def test_a_single_source_is_taken_as_it_is():
     fused = fuse([DEPTH])
     assert fused.scale == pytest.approx(1.02)
     assert fused.error == pytest.approx(0.02)
-    assert "to 3.9%, by sensor depth" in fused.describe()[0]
+    assert_facts(fused.describe()[0], "3.9%")
 
 
 def test_sources_that_agree_are_averaged_by_their_inverse_variance():
@@ -36,7 +37,7 @@ def test_the_one_of_three_that_contradicts_is_named_and_not_used():
     fused = fuse([POSES, wrong, other])
     assert fused.contradicting == (wrong,)
     assert fused.scale == pytest.approx(math.sqrt(1.005))
-    assert any("sensor depth is 900.0% larger" in text for text in fused.describe())
+    assert_facts("\n".join(fused.describe()), "900.0%")
 
 
 def test_two_that_contradict_a_little_leave_the_trusted_one_with_an_interval_over_both():
@@ -51,9 +52,9 @@ def test_two_that_contradict_by_a_unit_leave_no_scale():
     fused = fuse([POSES, ScaleSource("sensor depth", 3.28, 0.005)])
     assert fused.scale is None
     sentence, = fused.describe()
-    assert "the tracked poses" in sentence
+    assert_facts(sentence, "tracked", "poses")
     assert "sensor depth" in sentence
-    assert "--scale-between A B METRES" in sentence
+    assert_facts(sentence, "--scale-between", "METRES")
 
 
 def test_what_the_user_measured_decides():

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from facts import raises
 from PIL import Image
 from sfm_inputs import texture
 
@@ -23,6 +24,7 @@ from recon_cli.sfm.features.matching import (
     exhaustive_pairs,
     match_descriptors,
     match_pairs,
+    read_verified,
     sequential_pairs,
     similar_pairs,
 )
@@ -91,14 +93,14 @@ def test_known_intrinsics_are_taken_as_they_are(job):
 
 def test_a_frame_that_cannot_be_read_is_named(job):
     (job.frames / "b.png").write_bytes(b"no picture")
-    with pytest.raises(FormatError, match=r"1 of 3 frames cannot be read .* b\.png"):
+    with raises(FormatError, 1, 3, "b.png"):
         create_database(job)
     assert not job.database.exists()
 
 
 def test_a_frame_of_another_size_is_named(job):
     Image.new("RGB", (48, 64)).save(job.frames / "c.png")
-    with pytest.raises(FormatError, match=r"differ from the first in size: c\.png"):
+    with raises(FormatError, "c.png"):
         create_database(job)
 
 
@@ -216,6 +218,22 @@ def test_the_matches_are_those_of_colmaps_brute_force(job):
 def read_matches(job):
     with pycolmap.Database.open(job.database) as opened:
         return [opened.read_matches(*pair) for pair in ((1, 2), (1, 3), (2, 3))]
+
+
+def test_a_pair_whose_numbers_are_not_in_the_order_of_its_names_is_turned_round(tmp_path):
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.inlier_matches = np.array([[row, row + 100] for row in range(60)], np.uint32)
+    geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        camera = opened.write_camera(pycolmap.Camera.create_from_model_name(
+            1, "PINHOLE", 100.0, 64, 48))
+        ids = [opened.write_image(pycolmap.Image(name=name, camera_id=camera))
+               for name in ("b.png", "a.png")]
+        opened.write_two_view_geometry(*ids, geometry)
+    ((names, found),) = read_verified(tmp_path / "database.db").items()
+    assert names == ("a.png", "b.png")
+    assert found.inlier_matches[:, 0].min() == 100
+    assert found.inlier_matches[:, 1].max() == 59
 
 
 @pytest.mark.parametrize("threads", [2, 3])

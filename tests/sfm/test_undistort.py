@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from facts import assert_facts
 from sfm_inputs import texture
 from synthetic import make_capture, place_job
 
@@ -113,7 +114,7 @@ def test_a_lens_of_which_a_picture_shows_little_is_seen_whole_behind_a_mask(mapp
     stream = io.BytesIO()
     out = run(job, model, (3.0, 0.0, 0.0, 0.0), report=Reporter(stream))  # a pincushion
     (text,) = [text for text in map(parse, stream.getvalue().splitlines()) if isinstance(text, str)]
-    assert "1 pinhole view of each frame" in text
+    assert_facts(text, 1, "pinhole", "frame")
     assert len(list((out / "images").iterdir())) == len(job.names)
     for path in (out / "masks").iterdir():
         assert 0.5 < (read_png(path)[..., 0] == 255).mean() < 0.95

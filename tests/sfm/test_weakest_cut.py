@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from facts import assert_facts
 
 from recon_cli.sfm import limits
 from recon_cli.sfm.verdict import weakest_cut
@@ -123,7 +124,7 @@ def test_without_matches_nothing_is_known():
     made = evidence(halves(0.0), matches=lambda _a, _b: 1)
     link, _ = weakest_cut.find_weakest_cut(made)
     assert (link.share, link.explained) == (None, None)
-    assert "15 matched points" in link.reason
+    assert_facts(link.reason, 15, "matched")
 
 
 @pytest.mark.parametrize("across", [0.0, 0.25, 0.5])

@@ -8,6 +8,7 @@ import archive_splats
 import numpy as np
 import pytest
 import torch
+from facts import assert_facts, raises
 from scenes import camera_at, with_harmonics
 
 from recon_cli.errors import FormatError, InputError
@@ -207,13 +208,13 @@ def test_rotations_in_few_bits_are_read(tmp_path, component, kind, most):
 
 def test_scenes_that_no_file_can_hold_are_refused(tmp_path):
     splats = archive_splats.room(5)
-    with pytest.raises(InputError, match="no Gaussians"):
+    with raises(InputError, "Gaussians"):
         write_glb(tmp_path / "a.glb", splats.select(torch.arange(0)))
     splats.log_scales[1] = 90
-    with pytest.raises(InputError, match="overflows float32"):
+    with raises(InputError, "float32"):
         write_glb(tmp_path / "a.glb", splats)
     splats.log_scales[1] = torch.inf
-    with pytest.raises(InputError, match="not finite in log_scales"):
+    with raises(InputError, "log_scales"):
         write_glb(tmp_path / "a.glb", splats)
     assert list(tmp_path.iterdir()) == []
 
@@ -222,7 +223,7 @@ def test_a_file_without_gaussians_is_refused(tmp_path):
     write_glb(tmp_path / "a.glb", archive_splats.room(5))
     changed(tmp_path / "a.glb", lambda value: value["meshes"][0]["primitives"][0].update(
         extensions={}, attributes={"POSITION": 0}))
-    with pytest.raises(FormatError, match="no Gaussians") as caught:
+    with raises(FormatError, "Gaussians") as caught:
         load_glb(tmp_path / "a.glb")
     assert "again" not in caught.value.hint
 
@@ -247,7 +248,7 @@ def test_bytes_behind_the_container_are_left_out_with_a_warning(tmp_path, caplog
     with path.open("ab") as file:
         file.write(b"\n")
     assert len(load_glb(path).splats) == 5
-    assert "1 bytes after its data" in caplog.text
+    assert_facts(caplog.text, 1, "bytes", "data")
 
 
 @pytest.mark.parametrize(("up", "axes"), [

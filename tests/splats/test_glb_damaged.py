@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from examples import examples
+from facts import assert_facts, raises
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -79,7 +80,7 @@ def test_what_is_no_glb_is_refused(tmp_path, data, said):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="cannot be read"):
+    with raises(FormatError):
         load_glb(tmp_path / "none.glb")
 
 
@@ -183,7 +184,7 @@ def test_a_gaussian_that_is_not_finite_is_left_out_and_counted(
     left = load_glb(pack).splats
     assert torch.equal(left.means, whole.means[1:])
     assert torch.equal(left.sh_dc, whole.sh_dc[1:])
-    assert f"1 of {len(whole)} Gaussians are left out" in caplog.text
+    assert_facts(caplog.text, 1, len(whole), "Gaussians", "left")
 
 
 def test_nans_that_signal_are_refused_without_a_warning_where_most_are_bad(tmp_path, good):

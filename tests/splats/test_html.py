@@ -11,6 +11,7 @@ import pytest
 import torch
 from archive_splats import room
 from examples import examples
+from facts import raises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_cases import damaged, read_or_refused
@@ -188,9 +189,9 @@ def test_one_gaussian_makes_a_page(tmp_path):
 def test_what_no_spz_holds_no_page_holds_and_nothing_is_written(tmp_path):
     splats = room(9)
     splats.means[3, 1] = float("nan")
-    with pytest.raises(FormatError, match="not finite"):
+    with raises(FormatError, "finite"):
         write_html(tmp_path / "a.html", splats)
-    with pytest.raises(FormatError, match="no Gaussians"):
+    with raises(FormatError, "Gaussians"):
         write_html(tmp_path / "a.html", splats.select(torch.arange(0)))
     assert list(tmp_path.iterdir()) == []
 
@@ -246,7 +247,7 @@ def test_damaged_and_lying_pages_are_refused_with_the_reason(written, change, me
 
 
 def test_a_missing_page_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="cannot be read"):
+    with raises(FormatError):
         load_html(tmp_path / "none.html")
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from archive_splats import room
 from browser import WatchedPage
+from facts import assert_facts
 from PIL import Image
 from scenes import camera_at, one_splat
 from torch import Tensor
@@ -354,7 +355,7 @@ def test_without_webgl_2_the_page_says_what_to_do(page, tmp_path):
     page.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     path = made(tmp_path / "a.html", 0, 50)
     page.page.goto(path.as_uri())
-    assert "no WebGL 2" in page.page.locator("#message").inner_text()
+    assert_facts(page.page.locator("#message").inner_text(), "WebGL", 2)
     assert not page.page.locator("#reset").is_visible()
     page.assert_silent()
 

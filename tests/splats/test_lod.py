@@ -7,6 +7,7 @@ import shutil
 import archive_splats
 import pytest
 import torch
+from facts import raises
 
 from recon_cli.errors import FormatError
 from recon_cli.splats import lod
@@ -204,7 +205,7 @@ def test_a_pipe_among_the_files_is_not_waited_for(tmp_path):
     path = tmp_path / "0_0" / "means_l.webp"
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(FormatError, match="named pipe"):
+    with raises(FormatError, "pipe"):
         load_lod(tmp_path / "lod-meta.json")
 
 
@@ -214,5 +215,5 @@ def test_names_in_a_file_do_not_lead_out_of_its_folder(tmp_path):
     meta = json.loads(path.read_text())
     meta["means"]["files"][0] = "../0_1/means_l.webp"
     path.write_text(json.dumps(meta))
-    with pytest.raises(FormatError, match="leaves the folder"):
+    with raises(FormatError, "leaves", "folder"):
         load_lod(tmp_path / "lod-meta.json")

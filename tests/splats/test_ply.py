@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from examples import examples
+from facts import assert_facts, raises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import random_splats, with_harmonics
@@ -205,7 +206,7 @@ def test_elements_after_the_vertices_are_passed_over_where_their_size_is_known(
     assert torch.equal(read_ply(path).means, splats.means)
     path.write_bytes(data)
     rewritten(path, form, tail=tail + camera[:4])
-    with pytest.raises(FormatError, match="truncated"):
+    with raises(FormatError, "truncated"):
         read_ply(path)
 
 
@@ -216,7 +217,7 @@ def test_a_mesh_is_refused_by_what_it_is(tmp_path, splats, form):
     face = b"3 0 1 2\n" if form == "ascii" else b"\3" + bytes(12)
     rewritten(path, form, tail=b"\nelement face 1\nproperty list uchar int vertex_indices\n"
               b"end_header\nBODY" + face)
-    with pytest.raises(FormatError, match="a mesh, not Gaussians: 1 of face") as caught:
+    with raises(FormatError, 1, "Gaussians") as caught:
         read_ply(path)
     assert "again" not in caught.value.hint  # another copy is a mesh as well
 
@@ -228,14 +229,14 @@ def test_a_few_bytes_after_the_data_are_left_out_with_a_warning(tmp_path, splats
     with path.open("ab") as file:
         file.write(tail)
     assert torch.equal(read_ply(path).means, splats.means)
-    assert f"{len(tail)} bytes after its data" in caplog.text
+    assert_facts(caplog.text, len(tail), "bytes", "data")
 
 
 def test_a_header_of_hundreds_of_kilobytes_is_read(tmp_path, splats):
     write_ply(tmp_path / "a.ply", splats, comments=["x" * 1000] * 300)
     assert torch.equal(read_ply(tmp_path / "a.ply").means, splats.means)
     write_ply(tmp_path / "a.ply", splats, comments=["x" * 1000] * 1100)
-    with pytest.raises(FormatError, match=r"not a \.ply"):
+    with raises(FormatError):
         read_ply(tmp_path / "a.ply")
 
 
@@ -265,7 +266,7 @@ def test_a_count_that_the_file_cannot_hold_takes_no_memory(tmp_path, splats, for
     path.write_bytes(path.read_bytes().replace(b"vertex 20", b"vertex 9000000000"))
     tracemalloc.start()
     try:
-        with pytest.raises(FormatError, match="9000000000 of vertex"):
+        with raises(FormatError, 9000000000, "vertex"):
             read_ply(path)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
@@ -282,7 +283,7 @@ def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="cannot be read"):
+    with raises(FormatError):
         read_ply(tmp_path / "none.ply")
 
 

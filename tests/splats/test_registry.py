@@ -6,6 +6,7 @@ from pathlib import PurePath
 import pytest
 import torch
 from archive_splats import room
+from facts import raises
 
 from recon_cli.errors import FormatError
 from recon_cli.splats.format import WriteSettings
@@ -60,6 +61,6 @@ def test_a_file_that_is_cut_short_is_refused_under_any_name(name, tmp_path):
 
 
 def test_an_unknown_ending_is_refused_with_those_that_are_known(tmp_path):
-    with pytest.raises(FormatError, match="known format") as caught:
+    with raises(FormatError, "known", "format") as caught:
         read_splats(tmp_path / "room.xyz")
     assert ".spz" in caught.value.hint

@@ -12,6 +12,7 @@ import damage
 import numpy as np
 import pytest
 from examples import examples
+from facts import raises
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -96,7 +97,7 @@ def test_what_is_no_sog_is_refused(tmp_path, data, said):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="cannot be read"):
+    with raises(FormatError):
         load_sog(tmp_path / "none.sog")
 
 

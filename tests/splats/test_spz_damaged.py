@@ -7,6 +7,7 @@ import tracemalloc
 import pytest
 import zstandard
 from examples import examples
+from facts import assert_facts, raises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_cases import damaged, few, plain, read_or_refused
@@ -82,7 +83,7 @@ def test_damaged_files_of_version_4_are_refused(tmp_path, change, message):
 
 def test_a_missing_file_and_a_damaged_gzip_are_refused(tmp_path):
     for path in (tmp_path / "none.spz", tmp_path):
-        with pytest.raises(FormatError, match="cannot be read"):
+        with raises(FormatError):
             load_spz(path)
     path = tmp_path / "a.spz"
     write_spz(path, few())
@@ -101,7 +102,7 @@ def test_bytes_behind_the_data_are_left_out_with_a_warning(tmp_path, version, ca
     with path.open("ab") as file:
         file.write(b"\n")
     assert load_spz(path).splats.means.equal(wanted)
-    assert "1 bytes after its data" in caplog.text
+    assert_facts(caplog.text, 1, "bytes", "data")
 
 
 def refused_at(path, limit: int) -> str:

@@ -18,6 +18,7 @@ import killed
 import numpy as np
 import pytest
 import tiny_stages
+from facts import assert_facts
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import DenoiseConfig, EvaluateConfig, IngestConfig, PruneConfig
@@ -213,4 +214,4 @@ def test_unfinished_work_of_an_earlier_version_is_begun_anew_with_a_notice(
     steps.log_path(out).unlink(missing_ok=True)
     again, _ = workspace.begin(key, own_digests=own_digests)
     assert list(again.iterdir()) == []
-    assert "unfinished work is discarded" in caplog.text
+    assert_facts(caplog.text, "unfinished", "work", "discarded")

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.config.stages import DenoiseConfig
 from recon_cli.context import StageContext, StageInputs
@@ -157,5 +158,5 @@ def test_progress_is_recorded(ingest, tmp_path):
 
 def test_an_ingest_folder_that_misses_a_frame_is_an_error(ingest, tmp_path):
     (ingest / "frames" / "000004.png").write_bytes(b"")
-    with pytest.raises(FormatError, match=r"000004\.png"):
+    with raises(FormatError, "000004.png"):
         run(ingest, tmp_path / "out")

@@ -6,6 +6,7 @@ import logging
 
 import pytest
 import torch
+from facts import assert_facts, raises
 from foreign import truth
 from tiny_scene import make_inputs
 from tiny_stages import run_export
@@ -58,7 +59,7 @@ def test_planted_floaters_go_and_the_views_gain(given, tmp_path, caplog):
     left = {tuple(mean) for mean in read_ply(tmp_path / "splats.ply").means.tolist()}
     assert not left & {tuple(mean) for mean in whole.means[floats].tolist()}
     assert len(left) >= 0.9 * len(truth())  # some lie outside all views
-    assert "that make the views worse" in caplog.text
+    assert_facts(caplog.text, "make", "views", "worse")
 
 
 def test_the_same_goes_whatever_the_units_of_the_export(given, tmp_path):
@@ -98,7 +99,7 @@ def test_islands_go_without_views_and_floaters_are_refused(tmp_path):
     summary = exported(inputs, tmp_path, drop_islands=True)
     assert summary.gaussians == 900
     assert read_ply(tmp_path / "splats.ply").means[:, 2].abs().max() == 0
-    with pytest.raises(StageError, match="--drop-floaters"):
+    with raises(StageError, "--drop-floaters"):
         exported(inputs, tmp_path, drop_floaters=True)
 
 
@@ -111,7 +112,7 @@ def test_a_scene_in_another_frame_is_not_cleaned_by_the_views(given, tmp_path):
     import_scene.run(ImportConfig(), StageInputs(
         {name: inputs.folders[name] for name in ("ingest", "place")}, (tmp_path / "away.ply",)),
         tmp_path / "train", CONTEXT)
-    with pytest.raises(StageError, match="--drop-floaters needs views"):
+    with raises(StageError, "--drop-floaters"):
         exported(StageInputs({**inputs.folders, "train": tmp_path / "train"}), tmp_path,
                  drop_floaters=True)
 
@@ -124,6 +125,6 @@ def test_a_scene_that_no_view_sees_is_not_dropped_whole(given, tmp_path):
     for path in inputs.folders["train"].iterdir():
         (tmp_path / "train" / path.name).write_bytes(path.read_bytes())
     write_ply(tmp_path / "train" / "splats.ply", behind)
-    with pytest.raises(ConfigError, match="would remove all"):
+    with raises(ConfigError, "remove"):
         exported(StageInputs({**inputs.folders, "train": tmp_path / "train"}), tmp_path,
                  drop_floaters=True)

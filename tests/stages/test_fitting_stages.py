@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from facts import raises
 from killed import Killed, kill_after
 from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, run, without
 
@@ -132,7 +133,7 @@ def test_a_config_of_the_same_ratio_by_chance_keeps_other_gaussians(inputs, tmp_
 
 
 def test_nothing_to_train_on_is_an_error(inputs, tmp_path):
-    with pytest.raises(TrainingError, match="0 views"):
+    with raises(TrainingError, 0, "views"):
         run(train, CONFIG, holding_out(inputs, tmp_path, held_out=True), tmp_path / "out")
 
 

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from facts import assert_facts
 from foreign import recon, truth, with_views
 
 from recon_cli.cli import main
@@ -68,7 +69,7 @@ def test_another_file_makes_the_scene_stale_and_a_lost_one_does_not(alone, scene
 
 def test_without_views_files_are_written_and_checked(alone, capsys):
     assert recon("export", alone, "--format", "spz,glb,points.ply") == 0
-    assert "no views: checked on " in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "views", "checked")
     assert {"splats.spz", "splats.glb", "points.ply"} <= {
         path.name for path in (alone / "export").iterdir()}
     assert states(alone)["export"] == "fresh"
@@ -117,7 +118,7 @@ def test_an_import_does_not_replace_a_trained_scene_unasked(workspace, scene, ca
     assert recon("train", workspace, "--iterations", "5", "--max-size", "48") == 0
     before = (workspace / "train" / "splats.ply").read_bytes()
     assert recon("import", workspace, scene) == 4
-    assert "a scene that was trained" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "scene", "trained")
     assert (workspace / "train" / "splats.ply").read_bytes() == before
     assert recon("import", workspace, scene, "--again") == 0
     assert read_ply(workspace / "train" / "splats.ply").means.shape == (60, 3)

@@ -60,7 +60,7 @@ def test_a_jpeg_beside_its_raw_is_left_out_and_told(tmp_path, notices):
     assert take(folder, tmp_path / "out").frames == 3
     assert [frame["source"] for frame in listed(tmp_path / "out")["frames"]] == [
         "IMG_0000.dng", "IMG_0001.dng", "IMG_0002.dng"]
-    assert "2 photos are left out" in notices()[0]
+    assert_facts(notices()[0], 2, "photos", "left")
 
 
 def test_a_jpeg_takes_the_place_of_its_broken_raw(tmp_path):

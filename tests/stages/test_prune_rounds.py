@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from facts import raises
 from tiny_scene import make_inputs
 
 from recon_cli.config.stages import PRUNE_SCORES, PruneConfig, RunConfig, TrainConfig
@@ -167,7 +168,7 @@ def test_the_ply_is_no_larger_than_asked_for_and_not_much_smaller(inputs, tmp_pa
 
 
 def test_a_ply_too_small_for_one_gaussian_is_refused(inputs, tmp_path):
-    with pytest.raises(ConfigError, match=r"max_mb is 0\.0005"):
+    with raises(ConfigError, "max_mb", "0.0005"):
         run(PruneConfig(max_mb=0.0005), inputs, tmp_path / "out")
 
 
@@ -205,18 +206,18 @@ def test_where_every_removal_costs_too_much_nothing_goes(inputs, tmp_path, caplo
 
 def test_a_loss_of_psnr_without_validation_views_is_refused(inputs, tmp_path, monkeypatch):
     monkeypatch.setattr(prune_run, "read_config", lambda _: replace(RUN, validation=0.0))
-    with pytest.raises(TrainingError, match="validation views") as caught:
+    with raises(TrainingError, "validation", "views") as caught:
         run(SEARCH, inputs, tmp_path / "out")
     assert "--validation" in caught.value.hint
 
 
 def test_only_one_limit_may_be_given():
-    with pytest.raises(ConfigError, match="ratio and max_mb are given") as caught:
+    with raises(ConfigError, "max_mb") as caught:
         PruneConfig(ratio=0.5, max_mb=3.0)
     assert "max_gaussians" in caught.value.hint
 
 
 def test_a_loss_of_psnr_in_mid_training_is_refused():
-    with pytest.raises(ConfigError, match="a finished model") as caught:
+    with raises(ConfigError, "finished", "model") as caught:
         PruneConfig(max_psnr_drop=0.5, at="mid")
     assert "recon prune" in caught.value.hint

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import summaries
-from facts import assert_facts
+from facts import assert_facts, raises
 from sfm_inputs import run, run_here, run_place, texture, turning, write_inputs
 
 from recon_cli import time_estimate
@@ -31,7 +31,7 @@ from recon_cli.workspace.summaries import (
 
 def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
     grey = {f"{index:06d}.png": np.full((120, 160, 3), 90, np.uint8) for index in range(5)}
-    with pytest.raises(SfmError, match="No features: 0 of 5 frames"):
+    with raises(SfmError, 0, 5, "features"):
         run(write_inputs(tmp_path, grey), tmp_path / "out")
 
 
@@ -41,7 +41,7 @@ def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
 ])
 def test_a_camera_that_turns_on_the_spot_is_not_taken_for_a_success(tmp_path, pairs, count):
     out = tmp_path / "out"
-    with pytest.raises(SfmError, match="The camera did not move"):
+    with raises(SfmError, "camera", "move"):
         run_here(write_inputs(tmp_path, turning(12)), out, pairs=pairs, max_minutes=1.0)
     assert not (out / "sparse").exists()
     assert database.progress(out / "database.db", "matches") == count
@@ -94,7 +94,7 @@ def test_what_is_short_or_not_known_is_not_told(tmp_path, monkeypatch, changes):
 
 def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):
     images = {f"{seed}.png": texture(180, 240, seed) for seed in range(4)}
-    with pytest.raises(SfmError, match="No two frames match"):
+    with raises(SfmError, "frames", "match"):
         run_here(write_inputs(tmp_path, images), tmp_path / "out", max_minutes=1.0)
 
 
@@ -104,7 +104,7 @@ def test_a_missing_twin_is_found_before_anything_is_done(tmp_path):
     (base / "denoise" / "frames" / "1.png").unlink()
     found = SfmSummary(frames=3, poses=None, models=(3,), apart=(), attempts=(), seconds={}, parts=(
         PartSummary(names=("0.png", "1.png", "2.png"), points=9),))
-    with pytest.raises(FormatError, match=r"lacks 1 of 3 frames: 1\.png") as caught:
+    with raises(FormatError, 1, 3, "1.png") as caught:
         run_place(base, tmp_path / "sfm", found, tmp_path / "out")
     assert "recon denoise" in caught.value.hint
     assert not (tmp_path / "out" / "log.txt").exists()
@@ -114,7 +114,7 @@ def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
     base = write_inputs(
         tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
     (base / "ingest" / "frames" / "2.png").write_bytes(b"no picture")
-    with pytest.raises(FormatError, match=r"1 of 3 frames cannot be read .* 2\.png"):
+    with raises(FormatError, 1, 3, "2.png"):
         run(base, tmp_path / "out")
 
 
@@ -157,7 +157,7 @@ def test_frames_without_a_camera_are_told(caplog):
 
 def test_where_there_is_a_verdict_it_speaks_of_the_missing_frames(caplog):
     text = told(caplog, lines=("All but eleven hang together.",), verdict={"trusted": False})
-    assert "All but eleven hang together." in text
+    assert_facts(text, "eleven", "hang", "together")
     assert "11 of 60" not in text
 
 
@@ -199,7 +199,7 @@ def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monke
     monkeypatch.chdir(tmp_path)
     grey = {f"{index}.png": np.full((60, 80, 3), 90, np.uint8) for index in range(3)}
     write_inputs(Path("in"), grey)
-    with pytest.raises(SfmError, match="No features"):
+    with raises(SfmError, "features"):
         run(Path("in"), Path("out"))
 
 
@@ -230,6 +230,6 @@ def test_held_out_frames_of_a_part_that_is_left_out_are_counted():
 
 def test_a_camera_model_that_colmap_does_not_have_is_refused_by_name(tmp_path):
     inputs = write_inputs(tmp_path, turning(3))
-    with pytest.raises(ConfigError, match="camera_model is 'GOPRO'") as caught:
+    with raises(ConfigError, "GOPRO", "camera_model") as caught:
         run(inputs, tmp_path / "out", camera_model="GOPRO")
     assert "OPENCV_FISHEYE" in caught.value.hint

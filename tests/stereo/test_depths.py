@@ -76,6 +76,15 @@ def test_partners_see_the_same_from_another_place():
     assert order.index(1) < order.index(4) < order.index(8)
 
 
+def test_a_wider_angle_than_the_best_is_preferred_to_one_as_far_below_it():
+    """Depth from rays that are nearly parallel is uncertain."""
+    target = np.array([3.0, 0.0, 0.0])
+    turned = np.radians([0.0, 1.5, 9.0])
+    eyes = target - 3 * np.column_stack([np.cos(turned), np.sin(turned), np.zeros(3)])
+    partners = partners_of([camera(tuple(eye), tuple(target)) for eye in eyes])
+    assert list(partners[0][:2]) == [2, 1]
+
+
 def test_any_number_of_threads_gives_the_same_bytes(monkeypatch):
     views = views_of(AROUND[:4], grain)
     results = []

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import assert_facts, raises
 from posed_sets import make_replica
+from small_room import dots
 
 from recon_cli.cli import main
 from recon_cli.config.stages import ComputeConfig, TrainConfig
@@ -112,7 +114,7 @@ def test_recon_run_trains_in_blocks_and_goes_through_all_stages(workspace, capsy
              for word in ("--set", f"train.{text}")]
     # made pictures are fitted to 54 dB, of which the rounding of a page would lose too much
     assert recon(workspace, "run", "--format", "ply", "--threads", 1, *words) == 0
-    assert "have no common middle: the finished model is pruned" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "common", "middle", "finished")
     found = state(workspace, capsys)
     assert found["state"] == "fresh"
     assert found["summary"]["blocks"] == 2
@@ -137,7 +139,7 @@ def test_a_block_that_fails_stops_no_other_and_is_all_that_is_tried_again(
     executor.failing = {"0"}
     assert recon(workspace, "train", "--blocks", 2, *FAST) == 5
     error = capsys.readouterr().err
-    assert "1 of 2 blocks failed (0: No Gaussian is left)." in error
+    assert_facts(error, 1, 2, 0, "blocks", "Gaussian")
     assert str(workspace / ".partial" / "train" / "jobs" / "0" / blocks.OUTPUT) in error
     assert state(workspace, capsys)["state"] == "partial"
     executor.failing = set()
@@ -149,7 +151,7 @@ def test_a_block_that_fails_stops_no_other_and_is_all_that_is_tried_again(
     same, = {(folder / "train" / "splats.ply").read_bytes() for folder in (workspace, again)}
     assert same
     assert recon(workspace, "train", "--blocks", 2, *FAST) == 0
-    assert "train is up to date" in capsys.readouterr().out
+    assert_facts(capsys.readouterr().out, "train", "date")
     assert len(executor.ran) == 5
 
 
@@ -184,7 +186,7 @@ def test_other_options_begin_the_blocks_anew(workspace, executor, capsys):
 def test_more_steps_than_those_of_a_training_in_blocks_begin_anew(workspace, executor, capsys):
     assert recon(workspace, "train", "--blocks", 2, *FAST) == 0
     assert recon(workspace, "train", "--blocks", 2, *FAST[2:], "--iterations", 30, "-v") == 0
-    assert "the finished run was trained in blocks" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "finished", "trained", "blocks")
     assert executor.ran == ["0", "1", "0", "1"]
 
 
@@ -224,7 +226,7 @@ def test_a_merged_scene_too_large_to_train_is_kept_as_the_blocks_have_it(
     monkeypatch.setattr(merge_blocks, "gaussians_that_fit", lambda *_: 1)
     assert recon(workspace, "train", "--blocks", 2, *FAST) == 0
     assert executor.ran == ["0", "1"]
-    assert "room to train 1: the merged scene is not fine-tuned" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, 1, "merged", "fine-tuned")
     assert state(workspace, capsys)["summary"]["merge"]["iterations"] == 0
     assert not (workspace / "train" / "log.jsonl").exists()
     merged = read_ply(workspace / "train" / "splats.ply").means.numpy()
@@ -291,7 +293,7 @@ def test_what_an_option_does_not_do_is_told(caplog, options, said):
 
 
 def test_a_finished_scene_is_not_trained_further_in_blocks():
-    with pytest.raises(ConfigError, match="trained further as one model"):
+    with raises(ConfigError, "trained", "further"):
         stage._count_blocks(TrainConfig(blocks="2"), Scene(), object(), StageContext())
     assert stage._count_blocks(TrainConfig(), Scene(), object(), StageContext()) == 1
 
@@ -309,5 +311,13 @@ def test_a_job_comes_back_from_its_file_and_its_place_takes_no_part_in_its_key(t
     (tmp_path / "0").rename(tmp_path / "moved")
     assert BlockJob.read(tmp_path / "moved" / blocks.JOB).key.fingerprint == job.key.fingerprint
     (tmp_path / "moved" / blocks.JOB).write_bytes(b"damaged")
-    with pytest.raises(FormatError, match="does not describe a block"):
+    with raises(FormatError, "describe", "block"):
         BlockJob.read(tmp_path / "moved" / blocks.JOB)
+
+
+def test_of_a_block_only_what_lies_in_its_own_cell_is_merged():
+    """The neighbour has the rest, which it saw from nearer."""
+    cell = Cell(np.array([[0.0, 0, 0], [2, 0, 0]]), np.array([True, False]))
+    splats = dots([[0.2, 0, 0], [1.8, 0, 0], [-3, 0, 0]])
+    block = merge_blocks.TrainedBlock("0", splats, cell, frozenset(), None, None)
+    assert merge_blocks._own(block).means[:, 0].tolist() == pytest.approx([0.2, -3])

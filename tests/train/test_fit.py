@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from facts import raises
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from tiny_task import (
@@ -206,7 +207,7 @@ def test_a_truncated_checkpoint_is_refused(tmp_path):
     path = tmp_path / "state.safetensors"
     save_state(path, first_state())
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(FormatError, match="cannot be read"):
+    with raises(FormatError):
         load_state(path, CONFIG, EXTENT, torch.device("cpu"))
 
 
@@ -218,7 +219,7 @@ def test_a_checkpoint_that_holds_nan_is_refused_when_read(tmp_path):
     tensors = load_file(path)
     tensors["splats.quats"][2, 1] = torch.nan
     save_file(tensors, path, metadata=metadata)
-    with pytest.raises(TrainingError, match=r"damaged: splats\.quats holds values"):
+    with raises(TrainingError, "splats.quats"):
         load_state(path, CONFIG, EXTENT, torch.device("cpu"))
 
 
@@ -229,7 +230,7 @@ def test_a_state_that_diverged_is_not_saved_over_a_good_one(tmp_path):
     before = path.read_bytes()
     with torch.no_grad():
         state.splats.means[3] = torch.nan
-    with pytest.raises(TrainingError, match="diverged"):
+    with raises(TrainingError, "diverged"):
         save_state(path, state)
     assert path.read_bytes() == before
 
@@ -268,7 +269,7 @@ def test_a_loss_that_stays_not_finite_stops_the_run(backend):
     state = first_state(backend=backend)
     with torch.no_grad():
         state.splats.sh_dc.fill_(3e38)  # colours overflow in the sum over fragments
-    with pytest.raises(TrainingError, match="not finite at step 6, as at 5 steps before it"):
+    with raises(TrainingError, 6, 5, "finite"):
         run(state, tiny_task(backend=backend), 30)
 
 
@@ -295,5 +296,5 @@ def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monke
 @pytest.mark.parametrize("strategy", ["reference", "budget"])
 def test_deleting_every_gaussian_is_an_error(backend, strategy):
     config = RunConfig(iterations=40, densify_every=10, min_opacity=1.0, densify=strategy)
-    with pytest.raises(TrainingError, match="No Gaussian is left"):
+    with raises(TrainingError, "Gaussian", "left"):
         run(first_state(config, backend=backend), tiny_task(config, backend=backend), 40)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from facts import raises
 from scenes import camera_at
 from tiny_task import tiny_task
 
@@ -36,7 +37,7 @@ COST = estimator(Cost(0.01))  # ten milliseconds a step, whatever the count
 
 
 def test_iterations_and_minutes_exclude_each_other():
-    with pytest.raises(ConfigError, match="iterations is 100 and minutes is 2") as caught:
+    with raises(ConfigError, 100, 2, "iterations") as caught:
         TrainConfig(iterations=100, minutes=2)
     assert "--minutes" in caught.value.hint
 

@@ -1,6 +1,7 @@
 """The reference's plan, at its own length and scaled down."""
 
 import pytest
+from facts import raises
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.errors import ConfigError
@@ -52,7 +53,7 @@ def test_a_run_of_one_step_has_a_plan():
 
 
 def test_a_middle_before_the_end_of_densification_is_refused():
-    with pytest.raises(ConfigError, match="densification"):
+    with raises(ConfigError, "densification"):
         TrainConfig(mid=0.3)
 
 
@@ -129,3 +130,10 @@ def test_a_long_run_replaces_no_more_gaussians_in_all_than_a_short_one(first):
         times = sum(plan.densifies(i) for i in range(first + 1, first + steps + 1))
         assert times > 10
         assert plan.replaced * times == pytest.approx(0.4, rel=0.05)
+
+
+def test_images_are_reduced_up_to_the_very_step_that_ends_their_share():
+    plan = Schedule(RunConfig(densify="budget", iterations=100))
+    ((share, factor),) = plan.recipe.levels
+    last = round(100 * share)
+    assert [plan.level(step) for step in (1, last, last + 1, 100)] == [factor, factor, 1, 1]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from facts import raises
 from small_room import camera, dots, photo
 
 from recon_cli.errors import FormatError
@@ -59,6 +60,7 @@ def test_an_unseen_gaussian_is_at_the_widest_angle():
     sight = support.seen_from(splats.means, np.array([0.0, -2.0, 0.0]))
     assert support.count.tolist() == [1, 0]
     assert float(sight.angle[1]) == pytest.approx(np.pi)
+    assert support.span(splats.means).tolist() == [0, 0]
 
 
 def test_the_residual_is_the_error_of_the_pixels():
@@ -103,5 +105,5 @@ def test_what_is_saved_is_read_back(tmp_path):
 def test_a_damaged_file_is_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "s.safetensors").write_bytes(content)
-    with pytest.raises(FormatError, match="cannot be read"):
+    with raises(FormatError):
         ViewSupport.load(tmp_path / "s.safetensors")

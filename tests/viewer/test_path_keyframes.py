@@ -4,6 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
+from facts import raises
 from viewing import opened, until, view
 
 from recon_cli.errors import WorkspaceError
@@ -68,5 +69,5 @@ def test_a_path_never_takes_the_place_of_another_and_a_full_disk_is_told(tmp_pat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("recon_cli.viewer.keyframes.write_camera_path", fail)
-    with pytest.raises(WorkspaceError, match="No space left"):
+    with raises(WorkspaceError, "space", "left"):
         folder.save(path)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import raises
 from safetensors.numpy import save_file
 
 from recon_cli.errors import FormatError
@@ -26,6 +27,17 @@ def test_a_file_gets_the_permissions_that_the_umask_says(
     for name in ("a.safetensors", "b"):
         assert (tmp_path / name).stat().st_mode & 0o777 == mode
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_file_is_flushed_before_it_replaces_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, replace = list[str](), os.replace
+    monkeypatch.setattr(os, "fsync", lambda _file: calls.append("flush"))
+    monkeypatch.setattr(os, "replace", lambda *paths: (calls.append("rename"), replace(*paths)))
+    atomic.write_bytes(tmp_path / "a", b"x")
+    assert calls[:calls.index("rename")] == ["flush"]
+    assert (tmp_path / "a").read_bytes() == b"x"
 
 
 @pytest.mark.parametrize(("text", "reason"), [
@@ -54,7 +66,7 @@ def test_bytes_folders_fifos_and_huge_files_are_no_json(
     (tmp_path / "large").write_text("[1, 2, 3]")
     monkeypatch.setattr(atomic, "MAX_TEXT_BYTES", 8)
     for name in ("bytes", "folder", "fifo", "large", "missing"):
-        with pytest.raises(FormatError, match="cannot be read as JSON") as caught:
+        with raises(FormatError, "JSON") as caught:
             read_json(tmp_path / name, hint="Do this.")
         assert caught.value.hint == "Do this."
 

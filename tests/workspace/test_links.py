@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from facts import raises
 
 from recon_cli.errors import ManifestError
 from recon_cli.workspace import layout
@@ -68,7 +69,7 @@ def test_a_manifest_that_names_files_elsewhere_is_refused(
     file = {"sha256": "0", "size": 1, "mtime_ns": 1}
     rewrite(workspace.folder("train") / "manifest.json",
             lambda value: value["outputs"].update({name: file}))  # type: ignore[attr-defined]
-    with pytest.raises(ManifestError, match="not a file of a stage") as caught:
+    with raises(ManifestError, "file", "stage") as caught:
         workspace.manifest("train")
     assert "recon clean train" in caught.value.hint
 
@@ -84,11 +85,11 @@ def test_a_signed_manifest_with_values_of_other_types_is_refused(
     finish(workspace, "one")
     path = workspace.folder("train") / "manifest.json"
     rewrite(path, lambda content: content.update({key: value}))
-    with pytest.raises(ManifestError, match="not a manifest"):
+    with raises(ManifestError, "manifest"):
         workspace.manifest("train")
     rewrite(path, lambda content: content.pop(key))
     if key != "continues":
-        with pytest.raises(ManifestError, match="lacks"):
+        with raises(ManifestError, "lacks"):
             workspace.manifest("train")
 
 

@@ -4,6 +4,7 @@ import re
 import cv2
 import numpy as np
 import pytest
+from facts import assert_facts, raises
 from media import texture
 
 from recon_cli.config.stages import parse_holdout
@@ -75,7 +76,7 @@ def test_a_frame_of_other_types_or_elsewhere_is_refused(tmp_path, frame):
     write_list(tmp_path)
     assert read_frame_list(tmp_path).frames[0].name == "a.png"
     write_list(tmp_path, FRAME | frame)
-    with pytest.raises(FormatError, match=r"frames\.json") as caught:
+    with raises(FormatError, "frames.json") as caught:
         read_frame_list(tmp_path)
     assert caught.value.hint
 
@@ -88,7 +89,7 @@ def test_a_frame_of_other_types_or_elsewhere_is_refused(tmp_path, frame):
     {"lens": {"model": [], "width": 8, "height": 6, "params": [1, 1, 1, 1]}}])
 def test_a_group_that_is_none_is_refused(tmp_path, group):
     write_list(tmp_path, group=GROUP | group)
-    with pytest.raises(FormatError, match=r"frames\.json"):
+    with raises(FormatError, "frames.json"):
         read_frame_list(tmp_path)
 
 
@@ -107,7 +108,7 @@ def test_poses_that_are_not_finite_are_refused(tmp_path):
     text = (tmp_path / "poses.json").read_text()
     for junk in ("NaN", "1" * 400, '"x"', "[]"):
         (tmp_path / "poses.json").write_text(text.replace("1.0", junk, 1))
-        with pytest.raises(FormatError, match=r"poses\.json"):
+        with raises(FormatError, "poses.json"):
             read_poses(tmp_path / "poses.json")
 
 
@@ -173,8 +174,8 @@ def test_photos_in_a_text_are_named_by_their_own_files(tmp_path):
     assert name("000000.png and 000001.png.") == "2.jpg and 10.jpg."
     assert name("(000002.png)") == "(000001.png)", "once: not as the frame of that name"
     same = "000003.png, 000005.png (1.5 s), x000000.png, ingest/frames/000000.png, 000000.png.tmp"
-    assert name(same).startswith("000003.png, 000005.png (1.5 s), x000000.png, "
-                                 "ingest/frames/000000.png")
+    assert_facts(
+        name(same), "000003.png", "000005.png", "1.5", "x000000.png", "ingest/frames/000000.png")
     assert name_photos(tmp_path / "none")(same) == same
 
 

@@ -89,6 +89,13 @@ def test_a_file_cut_short_takes_its_step_back(finished):
     assert done(finished) == without("undistorted")
 
 
+def test_a_file_that_grew_takes_its_step_back(finished):
+    (finished / "sparse" / "images" / "a.bin").write_bytes(b"123456")
+    assert done(finished) == without("sparse")
+    assert StepFolder(finished).find_damage() == "sparse"
+    assert not StepFolder(finished).is_intact("sparse")
+
+
 def test_a_flipped_byte_is_found_before_a_step_is_believed(finished):
     assert StepFolder(finished).find_damage() == ""
     assert StepFolder(finished).is_intact("sparse")

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import summaries
+from facts import raises
 
 from recon_cli.errors import ManifestError
 from recon_cli.workspace.summaries import (
@@ -42,16 +43,16 @@ def test_the_keys_are_the_fields_in_order_without_what_does_not_apply():
 def test_a_record_of_another_version_is_refused_with_what_it_lacks():
     value = MAPPED.to_json()
     del value["world"]["evidence"]["up_found"]
-    with pytest.raises(ManifestError, match=r"up_found.*another version"):
+    with raises(ManifestError, "up_found"):
         PlaceSummary.from_json(value)
-    with pytest.raises(ManifestError, match="not a JSON object"):
+    with raises(ManifestError, "JSON"):
         PlaceSummary.from_json({**value, "world": 3})
 
 
 def test_a_value_of_another_type_is_refused_with_its_name():
-    with pytest.raises(ManifestError, match=r"3\.5 as gaussians.*another version"):
+    with raises(ManifestError, "3.5"):
         TrainSummary.from_json({**summaries.TRAIN.to_json(), "gaussians": 3.5})
-    with pytest.raises(ManifestError, match=r"None as rounds.*another version"):
+    with raises(ManifestError, "rounds", "version"):
         PruneSummary.from_json({**summaries.PRUNE.to_json(), "rounds": None})
 
 
