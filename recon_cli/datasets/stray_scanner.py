@@ -27,9 +27,10 @@ from recon_cli.datasets.frame_files import (
     read_csv,
 )
 from recon_cli.datasets.frame_table import Y_UP, FrameTable, LeftOutError
-from recon_cli.datasets.phone_gravity import UP_AGREES_DEG, read_gravity
+from recon_cli.datasets.phone_gravity import read_gravity
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
+from recon_cli.scene.gravity import MAX_UP_SPREAD_DEG
 
 _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -90,7 +91,7 @@ def _check_up(posed: PosedSet, imu: Path) -> PosedSet:
     if gravity is None or not gravity.is_sure:
         return posed
     off = float(np.degrees(np.arccos(np.clip(gravity.up @ np.array(Y_UP), -1, 1))))
-    if off <= UP_AGREES_DEG:  # ARKit's y is good to about one degree
+    if off <= MAX_UP_SPREAD_DEG:  # ARKit's y is good to about one degree
         return posed
     x, y, z = gravity.up
     return replace(posed, up=(float(x), float(y), float(z)), notices=(*posed.notices, (

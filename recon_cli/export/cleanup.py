@@ -36,11 +36,10 @@ from recon_cli.render.contract import ALPHA_MIN
 from recon_cli.render.depth_loss import LEAST_COVERAGE
 from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import EXTENT_SIGMAS, Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.values import measure_distances, measure_extent
 
-_TOUCH = 3.0  # standard deviations
 _NEIGHBOURS = 16  # compared with each; a surface around a Gaussian has about six
 _SMALL = 0.005  # of the Gaussians at most
 _APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
@@ -285,7 +284,7 @@ def _find_groups(means: NDArray[np.float64], splats: Splats) -> NDArray[np.int64
     for rank in range(1, _NEIGHBOURS + 1):  # one at a time: all at once would take gigabytes
         neighbour, apart = other[:, rank], distance[:, rank]
         way = (means[neighbour] - means) / np.maximum(apart, 1e-12)[:, None]
-        touch = np.flatnonzero(apart <= _TOUCH * (
+        touch = np.flatnonzero(apart <= EXTENT_SIGMAS * (
             _deviations_along(scales, rotation, way)
             + _deviations_along(scales[neighbour], rotation[neighbour], way)))
         sources.append(touch)

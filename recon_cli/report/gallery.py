@@ -20,9 +20,9 @@ from recon_cli.errors import FormatError
 from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.io.images import fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
+from recon_cli.stages.evaluate import GAIN
 
 MAX_FILE_BYTES = 15_000_000
-GAIN = 4  # of a difference, as in evaluate/difference
 MOST_ERROR = 256 // GAIN  # mean error in 1/255 from which on colours no longer change
 _HIDDEN = (96, 96, 96)  # of masked pixels in a difference: no colour of the map
 

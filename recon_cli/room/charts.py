@@ -20,7 +20,7 @@ from recon_cli.room.texture_kernels import draw
 _PADDING = 2  # texels between charts
 _SMOOTHED = 6  # rings of triangles that the direction of one is a mean over
 _STEPS = 8  # of k-means over the directions
-_LEAST_COSINE = 0.3  # between a triangle and the direction that it is seen along
+GRAZING = 0.3  # cosine between the normal of a surface and the direction that it is seen along
 _TINY = 40  # triangles; smaller pieces join their neighbours, if they face the same way at all
 _MERGED = 4  # times that this is tried
 _FACING = 0.1  # cosine, for that
@@ -95,7 +95,7 @@ def _label(
         directions = np.where((sums != 0).any(axis=1, keepdims=True), _unit(sums), directions)
     labels = (smooth @ directions.T).argmax(axis=1)
     cosines = unit @ directions.T
-    away = cosines[np.arange(len(labels)), labels] < _LEAST_COSINE
+    away = cosines[np.arange(len(labels)), labels] < GRAZING
     labels[away] = cosines[away].argmax(axis=1)
     for _ in range(_MERGED):
         pieces = _connect(labels, links)

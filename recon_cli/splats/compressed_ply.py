@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.views import evenly_spread
+from recon_cli.scene.backdrop import AT_ONCE
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.splats.foreign import count_terms, drop_not_finite
@@ -38,7 +39,6 @@ from recon_cli.splats.values import (
 )
 from recon_cli.workspace.atomic import replacing
 
-_CHUNK = 256
 _AXES, _COLORS = ("x", "y", "z"), ("r", "g", "b")
 _PLACE = [f"{end}_{axis}" for end in ("min", "max") for axis in _AXES]
 _SCALE = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in _AXES]
@@ -71,7 +71,7 @@ def write_compressed_ply(
     FormatError if there are no Gaussians, one is too large, or a parameter is not finite.
     """
     values = to_arrays(splats, path.name)
-    order = compact_order(values["means"], values["logit_opacities"], _CHUNK)
+    order = compact_order(values["means"], values["logit_opacities"], AT_ONCE)
     means, log_scales, quats, logits, sh_dc, sh_rest = (values[name][order] for name in (
         "means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest"))
     refuse_above(path, log_scales, _SCALE_RANGE)
@@ -96,16 +96,16 @@ def write_compressed_ply(
 def _header(n: int, terms: int, comments: Sequence[str]) -> bytes:
     rest = [f"uchar f_rest_{i}" for i in range(3 * terms)]
     return format_header({
-        "chunk": (-(-n // _CHUNK), [f"float {name}" for name in _BOUNDS]),
+        "chunk": (-(-n // AT_ONCE), [f"float {name}" for name in _BOUNDS]),
         "vertex": (n, [f"uint {name}" for name in _PACKED]), **({"sh": (n, rest)} if rest else {})},
         comments)
 
 
 def _bound_chunks(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
     """Returns the bounds [chunks, 6] of values [N, 3], and their positions in them, 0 to 1."""
-    starts = np.arange(0, len(values), _CHUNK)
+    starts = np.arange(0, len(values), AT_ONCE)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-    rows = np.arange(len(values)) // _CHUNK
+    rows = np.arange(len(values)) // AT_ONCE
     width = (high.astype(np.float64) - low)[rows]
     share = (values - low[rows].astype(np.float64)) / np.where(width > 0, width, 1)
     return np.concatenate([low, high], axis=1), share
@@ -165,8 +165,8 @@ def load_compressed_ply(path: Path) -> LoadedScene:
     tables = read_tables(header)
     chunk, vertex = tables["chunk"], tables["vertex"]
     n = len(vertex)
-    if not n or len(chunk) != -(-n // _CHUNK):
-        raise FormatError(f"{path} has {len(chunk)} chunks of {_CHUNK} for {n} Gaussians.")
+    if not n or len(chunk) != -(-n // AT_ONCE):
+        raise FormatError(f"{path} has {len(chunk)} chunks of {AT_ONCE} for {n} Gaussians.")
     place, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
     shares = _split_bits(color, (8, 8, 8), (24, 16, 8))
     colors = _interpolate(chunk, _COLOR, shares) if colored else shares
@@ -207,7 +207,7 @@ def _interpolate(
     """Returns the values of shares [N, 3] of the chunks' bounds."""
     with np.errstate(invalid="ignore"):  # bounds that are not finite make NaN, which is refused
         bounds = np.stack([chunk[name].astype(np.float64) for name in names], axis=1)
-        rows = np.arange(len(shares)) // _CHUNK
+        rows = np.arange(len(shares)) // AT_ONCE
         low, high = bounds[rows, :3], bounds[rows, 3:]
         return np.asarray(low * (1 - shares) + high * shares)
 

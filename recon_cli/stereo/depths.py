@@ -28,11 +28,11 @@ _LEAST_ANGLE = 1.0  # degrees; below it all depths look alike
 _LEAST_SHARED = 10  # points that two views must both see
 # The first search, at half the size: inverse depths evenly spread, over more than the surface spans
 _HYPOTHESES, _RADIUS = 64, 1
-_NEARER, _FARTHER = 0.7, 1.4
+_BEYOND = (0.7, 1.4)
 _COMPARED = 14  # partners at most; what is level or refined is compared with all
 # and along level planes, by their distance from the camera in median depths: in rooms from 65 cm,
 # which a table top lies below a standing person's eyes, to 3 m
-_LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
+_LEVELS, _HEIGHTS = 32, (0.25, 1.2)
 # The second one, about what the first found: a window then follows slanted surfaces.
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
@@ -97,7 +97,8 @@ def find_depths(
     """
     full = [(photo.grey, photo.view.camera) for photo in photos]
     half = [_halved(*image) for image in full]
-    ranges = np.array([(1 / (_FARTHER * photo.farthest), 1 / max(_NEARER * photo.nearest, near))
+    near_share, far_share = _BEYOND
+    ranges = np.array([(1 / (far_share * photo.farthest), 1 / max(near_share * photo.nearest, near))
                        for photo in photos])
     lowest = np.ascontiguousarray(ranges[:, 0])
     steps = (ranges[:, 1] - lowest) / (_HYPOTHESES - 1)
@@ -105,7 +106,7 @@ def find_depths(
     sweeps = [_Sweep(
         partners[:, :_COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
     if levels:
-        first, last = 1 / (_HIGHEST * levels.median), 1 / (_LOWEST * levels.median)
+        first, last = 1 / (_HEIGHTS[1] * levels.median), 1 / (_HEIGHTS[0] * levels.median)
         step = (last - first) / (_LEVELS - 1)
         sweeps.append(_Sweep(
             partners, base, np.full(len(photos), first), np.full(len(photos), step), _LEVELS,
@@ -167,8 +168,20 @@ def compile_kernels() -> None:
                 np.array([[1], [0]]), near=0.1)
 
 
+NEAREST = 0.02  # of the median depth; nothing nearer to a camera is a surface
+
+
+def spanned(depths: NDArray[np.floating]) -> tuple[float, float]:
+    """Returns how near and how far a view is searched: between the outer hundredths of [N]."""
+    near, far = np.quantile(depths, [0.01, 1 - 0.01])
+    return float(near), float(far)
+
+
+CAMERA_NUMBERS = 9 + 3 + 6  # rotation, translation, and focal lengths to size
+
+
 def camera_row(camera: Camera) -> NDArray[np.float64]:
-    """Returns a camera as the kernels read it, [18]."""
+    """Returns a camera as the kernels read it, [CAMERA_NUMBERS]."""
     return np.concatenate([
         camera.viewmat[:3, :3].reshape(-1), camera.viewmat[:3, 3],
         [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]])

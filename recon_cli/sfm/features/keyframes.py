@@ -14,8 +14,8 @@ import numpy as np
 
 from recon_cli.io.tracks import Tracks
 from recon_cli.sfm.features.matching import Pair
+from recon_cli.sfm.limits import FEW_FRAMES
 
-ALL = 200  # frames up to which all are keyframes
 # Tracks that a keyframe shares with the next one: of its own, and at least. No step is longer.
 SHARED, LEAST_SHARED, LONGEST = 0.5, 60, 6
 # Tracks from which on two frames are worth matching: of 774 pairs with fewer, five to ten keyframes
@@ -26,7 +26,7 @@ FEW_TRACKS = 5
 def choose_keyframes(tracks: Tracks) -> tuple[int, ...]:
     """Returns the rows of the keyframes of a video in order; the first and the last are two."""
     count = len(tracks.names)
-    if count <= ALL:
+    if count <= FEW_FRAMES:
         return tuple(range(count))
     seen = np.bincount(tracks.image, minlength=count)
     rows = [0]

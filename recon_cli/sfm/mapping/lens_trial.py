@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm.limits import MAX_ERROR_PX, MIN_TRACK_LENGTH
+from recon_cli.scene.statistics import MIN_OBSERVATIONS, OUTLIER_SIGMAS
+from recon_cli.sfm.limits import MAX_ERROR_PX
 from recon_cli.sfm.mapping import mapper
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.workspace.json_record import JsonRecord
 
 # The models that are tried. FULL_OPENCV gained .3% at most over the better of the last two.
 MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
-# Share of the error that another model must take away to be preferred, and by how many standard
-# errors. Of 20 captures by ordinary cameras OPENCV lost .9% at most against any other, but for one
+# Share of the error that another model must take away to be preferred, beside OUTLIER_SIGMAS of it.
+# Of 20 captures by ordinary cameras OPENCV lost .9% at most against any other, but for one
 # walk straight ahead, in which RADIAL was 2.5% better.
-CLEARLY, SIGMAS = 0.05, 3.0
+CLEARLY = 0.05
 # From which share on a model cannot be trusted. OPENCV lost 41% on a fisheye of 155 degrees, whose
 # cameras were 9 cm off in a room, and 18% on one of 104 degrees, with 1.8 cm. SIMPLE_RADIAL, which
 # only those get who ask for it, lost 6% at most in the 20 captures.
@@ -89,7 +90,7 @@ def find_better_lenses(
         better = min(names, key=lambda name: float(errors[name][number].mean()))
         gain, noise = gain_over(errors[better][number], ours)
         error, less = root(ours), root(errors[better][number])
-        if gain > max(CLEARLY, SIGMAS * noise) and error - less > LEAST_PX:
+        if gain > max(CLEARLY, OUTLIER_SIGMAS * noise) and error - less > LEAST_PX:
             found.append(BetterLens(number, camera.model_name, better, error, less, gain, noise))
     return tuple(found)
 
@@ -159,7 +160,7 @@ def _middle(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def _left_out(model: pycolmap.Reconstruction) -> list[int]:
     """Returns the points that are left out: every second one of those that enough images see."""
     return [number for number, point in sorted(model.points3D.items())
-            if point.track.length() >= MIN_TRACK_LENGTH][::2]
+            if point.track.length() >= MIN_OBSERVATIONS][::2]
 
 
 def _fit(

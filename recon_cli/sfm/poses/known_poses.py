@@ -22,7 +22,12 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
-from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
+from recon_cli.sfm.limits import (
+    COARSEST_KEYPOINTS,
+    MIN_CONFIRMED,
+    MIN_SPOT_AGREEING,
+    MIN_SPOT_MATCHES,
+)
 from recon_cli.sfm.mapping import checks, fallbacks, mapper, parts
 from recon_cli.sfm.mapping.merge_models import build_posed_model
 from recon_cli.sfm.model_arrays import viewmat_of
@@ -39,7 +44,6 @@ MAX_AXES_DEG = 75.0
 PLACES = 4  # of the spot check, spread over the images by name
 # Of the cameras nearest to each place: the next one, and one with a baseline that tells more.
 NEIGHBOURS = (0, 5)
-FEATURES = 1000  # keypoints an image
 
 Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
 
@@ -328,7 +332,8 @@ def spot_check(
         replace(group, names=chosen) for group in job.groups
         if (chosen := tuple(name for name in group.names if name in sampled)))
     sample = replace(
-        job, out=fresh_folder(job.attempts / "check"), groups=groups, max_features=FEATURES)
+        job, out=fresh_folder(job.attempts / "check"), groups=groups,
+        max_features=COARSEST_KEYPOINTS)
     silent = Reporter(io.BytesIO())
     matching.create_database(sample)
     try:
