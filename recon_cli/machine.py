@@ -40,7 +40,9 @@ _MEMORY_WORDS = (
     "can't allocate memory", "out of memory", "bad_alloc", "bad allocation")
 _CPUINFO = Path("/proc/cpuinfo")
 _LOW_PRIORITY = 5  # of POSIX: a third of the share of others; more, and who waits for it waits long
-_SAMPLE_SECONDS = 0.5  # a sample of all children takes about 5 ms
+# Between two looks at what another process or native code has done; and between two records of it:
+# a person sees no difference, a flush to disk and a sample of all children cost nothing so seldom.
+POLL_SECONDS, RECORD_SECONDS = 0.25, 0.5
 
 
 def versions() -> dict[str, str]:
@@ -228,7 +230,7 @@ class Meter:
         self._sample()
 
     def _watch(self) -> None:
-        while not self._done.wait(_SAMPLE_SECONDS):
+        while not self._done.wait(RECORD_SECONDS):
             self._sample()
 
     def _sample(self) -> None:

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.limits import MEASURE_SIZE, MIN_TRACKS, RETURN_ERROR, WINDOW
+from recon_cli.capture.limits import MEASURE_SIZE, MIN_TRACKS, RETURN_ERROR, TRACK_SIZE, WINDOW
 from recon_cli.errors import InputError
 
 Value = TypeVar("Value", np.uint8, np.float32)
 
-TRACK_WIDTH = 320  # pixels; wide enough for corners, small enough for 5 ms a frame
+TRACK_WIDTH = TRACK_SIZE // 2  # pixels; wide enough for corners, small enough for 5 ms a frame
 ANCHOR_REACH = 0.03  # of the width, about 10 px: still well inside the tracker's basin
 # Corners as in Shi and Tomasi; their spacing spreads 300 of them over the frame.
 MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING = 300, 0.005, 6

@@ -21,7 +21,7 @@ from recon_cli.errors import FormatError
 from recon_cli.io.calibration import undistort_pixels
 from recon_cli.io.depth_maps import LEAST_POINTS, MEDIAN, MOST_NOISE
 from recon_cli.scene.camera import Lens
-from recon_cli.scene.statistics import MIN_OBSERVATIONS, robust_sigma
+from recon_cli.scene.statistics import LEAST_SAMPLE, MIN_OBSERVATIONS, robust_sigma
 
 # Units of a stored value, in metres: what cameras and data sets write.
 _UNITS = {
@@ -35,7 +35,6 @@ _STARTS, _RANKS = 12, 7  # images that are compared, with the 1st, 2nd, 4th to 6
 # error of a centimetre is too large a part, and beyond it little is seen by both.
 _MOVED, _MOST_TURNED_DEG = (0.2, 1.0), 40.0
 _GRID = 40  # samples a side of a depth map
-_FEWEST = 100  # samples of a pair that both see
 _STEPS, _FINE = 9, np.geomspace(0.8, 1.25, 21)  # of the scales that are tried: 22%, then 2%
 # A scale shows, or is better than another one, if the other's error is this many times its own.
 CLEARLY_WORSE = 1.5
@@ -287,7 +286,7 @@ def _compare(
     errors = np.full(len(scales), np.inf)
     for at, (expected, actual) in enumerate(zip(seen[..., 2], depths, strict=True)):
         known = actual > 0
-        if known.sum() >= max(1, min(_FEWEST, len(rows) // 4)):
+        if known.sum() >= max(1, min(LEAST_SAMPLE, len(rows) // 4)):
             errors[at] = np.median(np.abs(expected[known] / actual[known] - 1))
     return errors
 

@@ -31,11 +31,13 @@ from recon_cli.datasets.phone_gravity import read_gravity
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
 from recon_cli.scene.gravity import MAX_UP_SPREAD_DEG
+from recon_cli.scene.statistics import at_least
 
 _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _IMU = "imu.csv"
-_SPARE_ROWS, _SPARE_SHARE = 3, 0.02  # by which rows and frames of a whole recording differ
+# By which rows and frames of a whole recording differ: at least, and of all.
+_SPARE_ROWS = (3, 0.02)
 _INNER = ("fx", "fy", "cx", "cy")
 
 
@@ -72,7 +74,7 @@ def read_stray(folder: Path) -> PosedSet:
                 time=find_number(row, "timestamp"),
                 depth=lidar_depth(depths.get(number), levels.get(number), lens)))
     table.rows.sort(key=lambda image: image.name)
-    if count and abs(count - len(rows)) > max(_SPARE_ROWS, _SPARE_SHARE * count):
+    if count and abs(count - len(rows)) > at_least(_SPARE_ROWS, count):
         table.notices.append(f"the video has {count} frames, but {_ODOMETRY} {len(rows)} rows: one "
                              "of them is cut short, or of another recording")
     return _check_up(table.finish_tracked(), folder / _IMU)

@@ -21,6 +21,7 @@ from recon_cli.config.stages import ComputeConfig
 from recon_cli.context import EarlierResult, StageContext, StageInputs, TrainCallback
 from recon_cli.deadline import Deadline
 from recon_cli.errors import ConfigError, InputError, ManifestError, ReconError, name_command
+from recon_cli.machine import RECORD_SECONDS
 from recon_cli.pipeline.continuation import Start, find_start
 from recon_cli.pipeline.freshness import WorkspaceCheck
 from recon_cli.progress import NullProgress, Progress, in_stage
@@ -30,8 +31,6 @@ from recon_cli.workspace.layout import Workspace
 from recon_cli.workspace.manifest import NAME as MANIFEST
 from recon_cli.workspace.manifest import Manifest, PartialRun, ResultKey, RunRecord
 from recon_cli.workspace.summaries import JsonRecord
-
-_RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
 
 logger = logging.getLogger("recon")
 
@@ -242,7 +241,7 @@ def _recorder(
 
     def record(done: int, total: int) -> None:
         nonlocal last
-        if done == total or time.monotonic() - last >= _RECORD_SECONDS:
+        if done == total or time.monotonic() - last >= RECORD_SECONDS:
             last = time.monotonic()
             workspace.record(dataclasses.replace(
                 earlier, done=done, total=total, seconds=earlier.seconds + meter.seconds))

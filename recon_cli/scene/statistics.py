@@ -14,10 +14,17 @@ COARSE_SAMPLE, FINE_SAMPLE = 4_000, 20_000
 # Views of a thing: of fewer one may be wrong; and those that a judgement needs, as two rays meet in
 # whatever way, and two views agree on much that is wrong.
 LEAST_WITNESSES, MIN_OBSERVATIONS = 2, 3
+LEAST_SAMPLE = 100  # points, of which fewer decide nothing
 # Samples that two views must share: their median is known to a fifth of their spread.
 LEAST_SHARED = 40
 UNCLIPPED = (12, 243)  # of 255, of a mean over some pixels, of which some may be clipped beyond
 ROUNDING = 1e-6  # relative: what float32 leaves of a value, and two machines may differ by
+
+
+def at_least(bound: tuple[int, float], whole: float) -> float:
+    """Returns the larger of the two that `bound` gives: a count, and a share of `whole`."""
+    count, share = bound
+    return max(count, share * whole)
 
 
 def robust_sigma(

@@ -45,7 +45,7 @@ _SCALE = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in _AXES]
 _COLOR = [f"{end}_{color}" for end in ("min", "max") for color in _COLORS]
 _BOUNDS = [*_PLACE, *_SCALE, *_COLOR]
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-_BITS, _SHIFTS = (11, 10, 11), (21, 11, 0)
+_BITS = (11, 10, 11)
 _SCALE_RANGE = 20.0  # of log scales; one of -1000 would leave the others of its chunk no bits
 _MOST_CENTERS = 32  # of the views, whose mean colour the rounding leaves alone
 _STEP = 1 / 32  # of a coefficient: 256 steps from -4 to 4
@@ -83,9 +83,9 @@ def write_compressed_ply(
     bounds, (place, scale, color) = zip(*[_bound_chunks(part) for part in parts], strict=True)
     alpha = encode_opacities(logits).astype(np.uint32)
     words = np.stack([
-        _join_bits(place, _BITS, _SHIFTS), _rotation_words(quats),
-        _join_bits(scale, _BITS, _SHIFTS),
-        _join_bits(color, (8, 8, 8), (24, 16, 8)) | alpha], axis=1)
+        _join_bits(place, _BITS), _rotation_words(quats),
+        _join_bits(scale, _BITS),
+        _join_bits(color, (8, 8, 8)) << 8 | alpha], axis=1)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header(len(splats), sh_rest.shape[1], comments))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
@@ -111,20 +111,22 @@ def _bound_chunks(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
     return np.concatenate([low, high], axis=1), share
 
 
-def _join_bits(
-    shares: NDArray[np.floating], bits: tuple[int, ...], shifts: tuple[int, ...]
-) -> Words:
-    """Returns words [N] of shares [N, 3], each in that many bits."""
+def _join_bits(shares: NDArray[np.floating], bits: tuple[int, ...]) -> Words:
+    """Returns words [N] of shares [N, 3], each in that many bits, the last one lowest."""
     most = (1 << np.array(bits)) - 1
     fields = np.clip(np.rint(shares * most), 0, most).astype(np.uint32)
-    return np.asarray(np.bitwise_or.reduce(fields << np.array(shifts, np.uint32), axis=1))
+    return np.asarray(np.bitwise_or.reduce(fields << _shifts(bits), axis=1))
+
+
+def _shifts(bits: tuple[int, ...]) -> NDArray[np.uint32]:
+    return np.append(np.cumsum(bits[:0:-1])[::-1], 0).astype(np.uint32)
 
 
 def _rotation_words(quats: Floats) -> Words:
     largest, others = encode_smallest_three(quats)
     shares = others / np.sqrt(2) + 0.5
     index = largest.astype(np.uint32) << np.uint32(30)
-    return index | _join_bits(shares, (10, 10, 10), (20, 10, 0))
+    return index | _join_bits(shares, (10, 10, 10))
 
 
 def _harmonic_bytes(sh_rest: Floats) -> Bytes:
@@ -171,9 +173,9 @@ def load_compressed_ply(path: Path) -> LoadedScene:
     shares = _split_bits(color, (8, 8, 8), (24, 16, 8))
     colors = _interpolate(chunk, _COLOR, shares) if colored else shares
     columns = drop_not_finite(path, {
-        "means": _interpolate(chunk, _PLACE, _split_bits(place, _BITS, _SHIFTS)),
+        "means": _interpolate(chunk, _PLACE, _split_bits(place, _BITS)),
         "quats": _rotations(rotation),
-        "log_scales": _interpolate(chunk, _SCALE, _split_bits(scale, _BITS, _SHIFTS)),
+        "log_scales": _interpolate(chunk, _SCALE, _split_bits(scale, _BITS)),
         "logit_opacities": decode_opacities((color & 255).astype(np.uint8)),
         "sh_dc": (colors - 0.5) / SH_C0,
         "sh_rest": _harmonics(path, tables, n),
@@ -193,12 +195,10 @@ def _has(kinds: dict[str, str], names: list[str], kind: str) -> bool:
     return all(kinds.get(name) == kind for name in names)
 
 
-def _split_bits(
-    words: Words, bits: tuple[int, ...], shifts: tuple[int, ...]
-) -> NDArray[np.float64]:
+def _split_bits(words: Words, bits: tuple[int, ...]) -> NDArray[np.float64]:
     """Returns [N, 3] shares of words [N]: the inverse of `_join_bits`."""
     most = (1 << np.array(bits, np.uint32)) - 1
-    return (words[:, None] >> np.array(shifts, np.uint32) & most) / most
+    return (words[:, None] >> _shifts(bits) & most) / most
 
 
 def _interpolate(
@@ -213,7 +213,7 @@ def _interpolate(
 
 
 def _rotations(words: Words) -> Floats:
-    others = (_split_bits(words, (10, 10, 10), (20, 10, 0)) - 0.5) * np.sqrt(2)
+    others = (_split_bits(words, (10, 10, 10)) - 0.5) * np.sqrt(2)
     return decode_smallest_three((words >> 30).astype(np.int64), others.astype(np.float32))
 
 

@@ -64,7 +64,8 @@ from recon_cli.workspace.atomic import write_bytes
 logger = logging.getLogger("recon")
 
 _FEWEST_BITS, POSITION_BITS = 8, 12  # fractional bits of a position: fewest, and Niantic's
-_MOST = (1 << 23) - 1  # of a position, in fractions
+_MAX_FRACTIONAL_BITS = 24  # as a position has in all
+_MOST = (1 << _MAX_FRACTIONAL_BITS - 1) - 1  # of a position, in fractions
 # Of the median Gaussian's size, by which a position is rounded. In a close-up of 0.2 mm Gaussians
 # 1/10 loses .34 dB, 1/20 .16 and 1/40 .11; each halving takes 2% more bytes.
 _ROUNDING = 1 / 32
@@ -94,7 +95,6 @@ _GZIP_HEADER = b"\x1f\x8b\x08\x10\0\0\0\0\0\xff"
 _COMMENT = re.compile(re.escape(_GZIP_HEADER) + rb"([ -~]{,40})\0")
 # Coefficients a channel that a file may have; those above degree 3 are cut off.
 _FILE_TERMS = (*TERMS, 24)
-_MAX_FRACTIONAL_BITS = 24
 _ZSTD_LEVEL = 12  # of Niantic's program, whose level of gzip is that of zlib
 
 

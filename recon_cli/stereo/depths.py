@@ -25,11 +25,11 @@ _LEAST_SIDE = 8  # pixels of any side; windows have 5
 # the best angle depth is uncertain, far beyond it surfaces look different.
 _ANGLE, _NARROWER, _WIDER = 5.0, 1.5, 8.0  # degrees: the best, and standard deviations
 _LEAST_ANGLE = 1.0  # degrees; below it all depths look alike
-_LEAST_SHARED = 10  # points that two views must both see
+LEAST_SEEN = 10  # points that a view, or two together, must see
 # The first search, at half the size: inverse depths evenly spread, over more than the surface spans
 _HYPOTHESES, _RADIUS = 64, 1
 _BEYOND = (0.7, 1.4)
-_COMPARED = 14  # partners at most; what is level or refined is compared with all
+COMPARED = 14  # partners of a view at most; what is level or refined is compared with all
 # and along level planes, by their distance from the camera in median depths: in rooms from 65 cm,
 # which a table top lies below a standing person's eyes, to 3 m
 _LEVELS, _HEIGHTS = 32, (0.25, 1.2)
@@ -104,7 +104,7 @@ def find_depths(
     steps = (ranges[:, 1] - lowest) / (_HYPOTHESES - 1)
     base = [np.zeros(image.shape, np.float32) for image, _ in half]
     sweeps = [_Sweep(
-        partners[:, :_COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
+        partners[:, :COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
     if levels:
         first, last = 1 / (_HEIGHTS[1] * levels.median), 1 / (_HEIGHTS[0] * levels.median)
         step = (last - first) / (_LEVELS - 1)
@@ -143,7 +143,7 @@ def find_partners(
         spread = np.where(angles < _ANGLE, _NARROWER, _WIDER)
         both = seen[:, mine] & (angles >= _LEAST_ANGLE)
         worth = (both * np.exp(-0.5 * ((angles - _ANGLE) / spread) ** 2)).sum(axis=1)
-        worth[both.sum(axis=1) < _LEAST_SHARED] = 0
+        worth[both.sum(axis=1) < LEAST_SEEN] = 0
         worth[own] = 0
         best = np.argsort(-worth, kind="stable")[:most]
         best = best[worth[best] > 0]

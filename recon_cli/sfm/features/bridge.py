@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.images import read_png
 from recon_cli.scene.matches import MAX_RATIO
+from recon_cli.scene.statistics import at_least
 from recon_cli.sfm import database
 from recon_cli.sfm.features import matching, xfeat_weights
 from recon_cli.sfm.features.features import DESCRIPTOR_SCALE
@@ -47,8 +48,8 @@ ATTEMPT = "bridge"
 # may be EXACT_PX off in an image of LONGER_SIDE. By these alone 46 of 67 pairs of a wall of lockers
 # were false.
 MIN_INLIER_SHARE = 0.3
-# SIFT's own matches that must lie on the geometry, and their share: 0 of 13 pairs are false so.
-MIN_AGREEING, MIN_AGREEING_SHARE = 6, 0.2
+# SIFT's own matches that must lie on the geometry: at least, and of all. 0 of 13 pairs are false.
+MIN_AGREEING = (6, 0.2)
 MIN_COSINE = 0.82  # of two learned descriptors (paper)
 
 Rows = NDArray[np.int64]  # [M, 2] rows of keypoints in two images
@@ -192,7 +193,7 @@ def find_bridge(
     own = match_sift(similarity)
     off = epipolar_distances(geometry.F, first.xy[own[:, 0]], second.xy[own[:, 1]])
     agreeing = np.count_nonzero(off < options.ransac.max_error)
-    if agreeing < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(own)):
+    if agreeing < at_least(MIN_AGREEING, len(own)):
         return None
     similarity[~near_epipolar_lines(
         geometry.F, first.xy, second.xy, options.ransac.max_error)] = -1

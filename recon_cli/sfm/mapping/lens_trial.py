@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.scene.statistics import MIN_OBSERVATIONS, OUTLIER_SIGMAS
+from recon_cli.scene.statistics import LEAST_SAMPLE, MIN_OBSERVATIONS, OUTLIER_SIGMAS
 from recon_cli.sfm.limits import MAX_ERROR_PX
 from recon_cli.sfm.mapping import mapper
 from recon_cli.sfm.model_arrays import registered_images
@@ -33,7 +33,7 @@ CLEARLY = 0.05
 # only those get who ask for it, lost 6% at most in the 20 captures.
 WRONG = 0.10
 LEAST_PX = 0.02  # that it must take away: features are not found more exactly
-LEAST_POINTS, LEAST_IMAGES = 100, 5  # that are judged; fewer decide nothing
+LEAST_IMAGES = 5  # that are judged; fewer decide nothing
 MOST_IMAGES = 40  # of a camera; they show a lens as well as all
 _GRID = 15  # pixels a side, by which a camera is put into another model
 _EVALUATIONS = 60  # of that fit
@@ -78,7 +78,7 @@ def find_better_lenses(
     part = _middle(model)
     own = {number: part.camera(number) for number in sorted(cameras)
            if number in part.cameras}
-    if not own or len(_left_out(part)) < LEAST_POINTS:
+    if not own or len(_left_out(part)) < LEAST_SAMPLE:
         return ()
     names = dict.fromkeys([*(camera.model_name for camera in own.values()), *MODELS])
     errors = {name: try_lens(part, own, name) for name in names}

@@ -52,7 +52,7 @@ STEPS = (1, 2)
 ROUNDS_DEG = (1.5, 0.0)
 # Standard deviation of a tracked position before it is measured, and the least one, as shares of
 # the size of the path.
-FIRST_DEVIATION, LEAST_DEVIATION = 0.02, 0.001
+DEVIATIONS = (0.02, 0.001)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +139,7 @@ def adjust_tracked(
     model, cache = _posed(job, viewmats), _cache(job)
     priors = {name: _center(viewmat) for name, viewmat in viewmats.items()}
     size = float(np.linalg.norm(np.ptp(np.array(list(priors.values())), axis=0))) or 1.0
-    deviation, before = FIRST_DEVIATION * size, 0.0
+    deviation, before = DEVIATIONS[0] * size, 0.0
     for number, angle in enumerate(ROUNDS_DEG):
         off = _widest(model, angle)
         if number:
@@ -153,7 +153,7 @@ def adjust_tracked(
                           if count < MIN_POSE_INLIERS})
         adjust_with_priors(
             model, priors, deviation, constant=constant, seed=job.seed, max_error=off)
-        deviation = max(measure_deviation(model, priors), LEAST_DEVIATION * size)
+        deviation = max(measure_deviation(model, priors), DEVIATIONS[1] * size)
         if set(job.names) - set(viewmats):
             mapper.resect(job, model)
     placed = set(mapper.list_registered(model))

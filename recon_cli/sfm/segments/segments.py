@@ -29,6 +29,7 @@ from recon_cli.errors import (
 from recon_cli.io.tracks import Tracks
 from recon_cli.jobs.executor import Command, Executor
 from recon_cli.jobs.shared_jobs import JobEnd, SharedJob, run_jobs
+from recon_cli.machine import RECORD_SECONDS
 from recon_cli.progress import NullProgress, Progress
 from recon_cli.sfm.features.keyframes import choose_keyframes
 from recon_cli.sfm.job import SPLIT, MappingJob
@@ -48,7 +49,6 @@ TRIES = 2  # of a mapping process that is killed, perhaps for want of memory bes
 COMMAND = "map-segment"  # of recon, which takes JOB
 # in the folder of a segment: what to do, how much of it is done, and what the command printed
 JOB, PROGRESS, OUTPUT = "segment.json", "progress.json", "output.txt"
-_RECORD_SECONDS = 0.5  # between two writes of how much is done
 _ERRORS: dict[int, type[ReconError]] = {
     kind.exit_code: kind for kind in (FormatError, BackendError, WorkspaceError)}
 
@@ -229,7 +229,7 @@ def map_segment(file: Path) -> None:
 
     def record(done: int, total: int) -> None:
         nonlocal last
-        if time.monotonic() - last >= _RECORD_SECONDS:
+        if time.monotonic() - last >= RECORD_SECONDS:
             last = time.monotonic()
             write_json(job.out / PROGRESS, [done, total])
 

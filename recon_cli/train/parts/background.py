@@ -44,11 +44,11 @@ _MISSED, _BEFORE, _SIDES_DEG = 0.25, 0.9, 10.0
 _FILL_DEGREES = 12.0  # directions this close to a far one become far: frames and trees hide some
 # Of gaps between points, in the reduced images. Set beforehand, and held against views in the
 # middle of stretches that were taken away (tests/bench/notes/training.md); .1 gained as much.
-_GAP_GRID = 4  # pixels from one place that is looked at to the next
+_GAP_GRID = _COVER_RANGE[1]  # pixels from one place that is looked at to the next
 _NEIGHBOURS = 12  # points whose median depth a gap has
 _GAP_CELL = 0.06  # of the median depth of all gaps: places within are one
 _THROUGH = 1.15  # times the depth of a gap: a point beyond it, this many pixels away or less, shows
-_THROUGH_RANGE = 2  # that the gap is seen through
+_THROUGH_RANGE = _GAP_GRID / 2  # that the gap is seen through
 _THROUGH_SHARE = 0.2  # of the views that look there; the points of some lie behind what hides them
 _OPACITY = 0.5
 _SPACING = 0.6  # of the distance between directions: the standard deviation

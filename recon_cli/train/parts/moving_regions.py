@@ -21,10 +21,9 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.statistics import MIN_OBSERVATIONS, OUTLIER_SIGMAS
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import unproject
+from recon_cli.stereo.depths import COMPARED, unproject
 from recon_cli.train.parts.part import SEARCH_SIDE
 
-_OTHERS = 14  # views that each is compared with, spread over all that show the same
 _SHARED = 0.15  # of a view's surface that another must see to be one of them
 _GRID = 6  # pixels from one to the next that are looked at to tell that
 _TOLERANCE = 0.06  # of a depth, within which two views see the same surface
@@ -95,7 +94,7 @@ def _smooth(error: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def find_overlapping(
-    own: ComparedView, views: Sequence[ComparedView], most: int = _OTHERS
+    own: ComparedView, views: Sequence[ComparedView], most: int = COMPARED
 ) -> NDArray[np.int64]:
     """Returns which of `views` see the surface of another view, spread evenly over the capture."""
     pixels = _grid(own.depth)

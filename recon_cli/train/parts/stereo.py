@@ -21,6 +21,7 @@ from recon_cli.scene.statistics import COARSE_SAMPLE, LEAST_WITNESSES
 from recon_cli.scene.train_view import TrainView
 from recon_cli.scene.voxels import SURFACE_CELL, number_cells
 from recon_cli.stereo.depths import (
+    LEAST_SEEN,
     NEAREST,
     StereoView,
     find_depths,
@@ -34,7 +35,6 @@ from recon_cli.train.parts.sparse_points import estimate_gains
 
 _SIDE = 300  # pixels of their longer side
 _NEIGHBOURS = 10  # views that each is compared with
-_LEAST_SEEN = 10  # sparse points that tell between which depths a view is searched
 
 logger = logging.getLogger("recon")
 
@@ -78,7 +78,7 @@ def find_surfaces(evidence: Evidence, deadline: Deadline | None = None) -> Surfa
     depths = [view.camera.viewmat[2, :3] @ points[mine].T + view.camera.viewmat[2, 3]
               for view, mine in zip(chosen, seen, strict=True)]
     depths = [depth[depth > 0] for depth in depths]
-    usable = [len(depth) >= _LEAST_SEEN for depth in depths]
+    usable = [len(depth) >= LEAST_SEEN for depth in depths]
     if sum(usable) < LEAST_WITNESSES:
         return SurfacePoints.nothing()
     chosen, depths = (list(compress(every, usable)) for every in (chosen, depths))
