@@ -17,13 +17,13 @@ from markupsafe import Markup, escape
 
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import ConfigError, FormatError, WorkspaceError
+from recon_cli.evaluation.metrics import ERROR_GAIN
 from recon_cli.evaluation.scores import Metrics
 from recon_cli.pipeline.execute import Job, last_sources
 from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.capture import read_capture
 from recon_cli.report.curves import draw_rounds, draw_training_curves
 from recon_cli.report.gallery import (
-    GAIN,
     MAX_FILE_BYTES,
     MOST_ERROR,
     Gallery,
@@ -159,7 +159,7 @@ def _template_values(
         "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),
         "longest": max(run.seconds for run in runs),
         "largest": max(run.peak_memory_bytes for run in runs),
-        "icon": ICON, "gain": GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),
+        "icon": ICON, "gain": ERROR_GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),
     }
 
 

@@ -17,13 +17,13 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.evaluation.metrics import ERROR_GAIN
 from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.io.images import fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
-from recon_cli.stages.evaluate import GAIN
 
 MAX_FILE_BYTES = 15_000_000
-MOST_ERROR = 256 // GAIN  # mean error in 1/255 from which on colours no longer change
+MOST_ERROR = 256 // ERROR_GAIN  # mean error in 1/255 from which on colours no longer change
 _HIDDEN = (96, 96, 96)  # of masked pixels in a difference: no colour of the map
 
 
@@ -238,7 +238,7 @@ def draw_difference(
     size = fit_size(error.shape[1], error.shape[0], longest)
     if size != error.shape[::-1]:
         error = cv2.resize(error, size, interpolation=cv2.INTER_AREA)
-    colors = apply_colormap(np.rint(error * GAIN).clip(0, 255).astype(np.uint8))
+    colors = apply_colormap(np.rint(error * ERROR_GAIN).clip(0, 255).astype(np.uint8))
     if hidden is not None and hidden.any():
         small = cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         colors[small > 0.5] = _HIDDEN

@@ -9,8 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon_cli.scene.splats import TERMS
-
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658,
@@ -34,7 +32,7 @@ def basis_rest(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(terms, dim=-1)
 
 
-_DEGREE = len(TERMS) - 1
+_DEGREE = 3
 # The 2l+1 functions of degree l are determined by their values in 2l+1 general directions. 64 of a
 # Fibonacci lattice keep the least squares at a condition number under 1.03 for every degree.
 _DIRECTIONS = 64

@@ -21,10 +21,10 @@ UNCLIPPED = (12, 243)  # of 255, of a mean over some pixels, of which some may b
 ROUNDING = 1e-6  # relative: what float32 leaves of a value, and two machines may differ by
 
 
-def at_least(bound: tuple[int, float], whole: float) -> float:
-    """Returns the larger of the two that `bound` gives: a count, and a share of `whole`."""
-    count, share = bound
-    return max(count, share * whole)
+def at_least(bound: tuple[float, float], whole: float) -> float:
+    """Returns the larger of the two that `bound` gives: a number, and a multiple of `whole`."""
+    least, share = bound
+    return max(least, share * whole)
 
 
 def robust_sigma(

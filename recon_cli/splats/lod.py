@@ -34,7 +34,13 @@ from recon_cli.splats.sog import (
     pack_splats,
     read_files,
 )
-from recon_cli.splats.values import Floats, UntrustedFile, describe_asset, normalize_quats
+from recon_cli.splats.values import (
+    MOST_PARTS,
+    Floats,
+    UntrustedFile,
+    describe_asset,
+    normalize_quats,
+)
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import remove
 from recon_cli.workspace.paths import leads_out
@@ -47,7 +53,6 @@ _LEVELS = 6  # at most
 _LEAF = 30_000
 _FILE = 4 * _LEAF
 _META_LIMIT = 64 << 20  # bytes
-_FILES_LIMIT = 1 << 16
 _FOLDER = re.compile(r"\d+_\d+")  # a file of a level: {level}_{number}
 
 
@@ -265,7 +270,7 @@ class _Index(UntrustedFile):
         # files from before version 1 do not have a number
         self.integer(self.meta, "version", _VERSION, _VERSION, default=_VERSION)
         names = self.meta.get("filenames")
-        if not isinstance(names, list) or len(names) > _FILES_LIMIT or not all(
+        if not isinstance(names, list) or len(names) > MOST_PARTS or not all(
                 isinstance(name, str) for name in names):
             raise self.error(f"filenames = {names!r:.40}; needed is a list of names")
         self.names: list[str] = names

@@ -23,6 +23,7 @@ _SHELL = 1.5  # outer distance over the inner one
 _LARGEST = float(np.finfo(np.float32).max)
 # Limits of what a file unpacks to. A .spz whose harmonics are all 0 reaches 5 times its size.
 HARMLESS_BYTES, MAX_RATIO = 1 << 24, 128
+MOST_PARTS = 1 << 16  # of a scene: files or chunks
 MOST_HEAD_BYTES = 1 << 20  # of what describes a file; most need a hundredth of it
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

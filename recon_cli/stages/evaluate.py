@@ -24,6 +24,7 @@ from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
     CONVENTION_LINES,
     CONVENTIONS,
+    ERROR_GAIN,
     FACES_CONVENTION,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
@@ -68,7 +69,6 @@ from recon_cli.workspace.atomic import write_json, write_text
 from recon_cli.workspace.records import Frame, ImportRecord, describe_stretches, read_frame_list
 from recon_cli.workspace.summaries import EvaluateSummary, WorldSummary
 
-GAIN = 4  # of the difference images
 _ANY_ITERATION = 1 << 62  # beyond the last
 _SEEN_VIEWS = 20  # training and validation views that are also scored, at most
 _STAGES = {"base": "train", "pruned": "prune"}  # by model
@@ -275,7 +275,7 @@ def _save_pictures(
     """Saves the render of a held-out view, and its difference from the photo."""
     name, rendered = f"{Path(frame).stem}.png", to_uint8(image)
     _save(out / "renders" / model / name, rendered)
-    difference = np.abs(rendered.astype(np.int16) - photo) * GAIN
+    difference = np.abs(rendered.astype(np.int16) - photo) * ERROR_GAIN
     if mask is not None:
         difference[~mask] = 0
     _save(out / "difference" / model / name, difference.clip(0, 255).astype(np.uint8))

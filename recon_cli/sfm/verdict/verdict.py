@@ -41,7 +41,7 @@ from recon_cli.workspace.json_record import KEY, JsonRecord
 # measured: 1.1 to 2.8 in good models, 9 to 20 where cameras are displaced.
 MAX_STEP = 6.0
 WINDOW = 15  # steps; a median over fewer follows the jump itself
-MIN_STEPS = 5  # fewer say nothing about what is usual
+MIN_STEPS = WINDOW // 3  # fewer say nothing about what is usual
 # Longer steps cannot be a cut in a video: displaced cameras gave 9 to 20, a walk's end at rest 6.
 MAX_LEAP = 100.0
 # Share of the median sharpness below which an image is called blurred, as in IngestConfig.

@@ -19,7 +19,7 @@ from recon_cli.io.images import reduce_to
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
-from recon_cli.scene.statistics import MIN_OBSERVATIONS, OUTLIER_SIGMAS
+from recon_cli.scene.statistics import MIN_OBSERVATIONS, OUTLIER_SIGMAS, at_least
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo.depths import COMPARED, unproject
 from recon_cli.train.parts.part import SEARCH_SIDE
@@ -34,9 +34,9 @@ _MARGIN = round(2 * _SMOOTH)
 _DARK = 0.06  # brightness from which a pixel tells the gain of a view
 # A region begins where the contradiction is beyond all noise and ends where it is no more. Noise is
 # the capture's own: the median over all pixels of all views.
-_STRONG = 8.0  # times the noise
-# Of the brightness. A shadow begins faintly: what is fainter than _TELLS only adds to a region.
-_LEAST_STRONG, _TELLS, _LEAST_WEAK = 0.10, 0.04, 0.025
+# The brightness of the one and of the other: at least, and in noises.
+_STRONG, _WEAK = (0.10, 8.0), (0.025, OUTLIER_SIGMAS)
+_TELLS = 0.04  # brightness; shadows begin faintly: what is fainter only adds to a region
 _AREA = 0.004  # of a view's pixels; smaller regions are errors of the model
 # Half of a region must be this many times beyond the spread of the others, who must agree. After a
 # short run it was 15 and more for 40 made people and 30 for a monitor that shows something else
@@ -230,8 +230,8 @@ def _thresholds(
     beyond: NDArray[np.float32], noise: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Returns where an error is strong, and where it is weak or strong."""
-    strong = _morphed(beyond > max(_LEAST_STRONG, _STRONG * noise), cv2.MORPH_OPEN, 1)
-    weak = strong | (beyond > max(_LEAST_WEAK, OUTLIER_SIGMAS * noise))
+    strong = _morphed(beyond > at_least(_STRONG, noise), cv2.MORPH_OPEN, 1)
+    weak = strong | (beyond > at_least(_WEAK, noise))
     return strong, _morphed(weak, cv2.MORPH_CLOSE, 2)
 
 
