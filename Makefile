@@ -17,7 +17,7 @@ FLOORS := .venv-floors
 # Bytecode is kept, whatever the environment says: else each process compiles all modules anew, and
 # pytest rewrites each test's assertions.
 unexport PYTHONDONTWRITEBYTECODE
-.PHONY: demo test test-other-cpu test-floors test-rest test-all coverage faults check docs clean
+.PHONY: demo test times test-other-cpu test-floors test-rest test-all coverage faults check docs clean
 
 demo: $(READY)
 	$(BIN)/recon demo
@@ -43,6 +43,10 @@ test-rest: $(DEV)
 
 test-all: $(DEV)
 	HYPOTHESIS_PROFILE=full $(PYTEST) -m ""
+
+# Where the time of `make test` goes.
+times: $(DEV)
+	$(BIN)/python tests/time_table.py $(ON_ALL) -m "not ($(HEAVY))"
 
 coverage: $(DEV)
 	$(PYTEST) --cov=recon_cli --cov-report=term

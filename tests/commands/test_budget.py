@@ -48,7 +48,7 @@ class FakeRun:
                          "prune": self.pruning * self.training}[stage]
 
 
-USUAL = {"ingest": 8.0, "denoise": 3.0, "sfm": 40.0, "evaluate": 20.0, "export": 10.0}
+USUAL = {"ingest": 8.0, "denoise": 3.0, "sfm": 40.0, "place": 0.0, "evaluate": 20.0, "export": 10.0}
 
 
 def run(tmp_path, clock, minutes, *, with_prune=True):

@@ -273,7 +273,7 @@ def test_bridges_that_place_too_few_are_mapped_again_with_lower_thresholds(
 
 
 @pytest.mark.parametrize("change", [
-    {"pairs": "exhaustive"}, {"last": "model"}, {"segments": (("0",), ("1",))}])
+    {"pairs": "exhaustive"}, {"is_segment": True}, {"segments": (("0",), ("1",))}])
 def test_segments_and_named_pairs_are_not_bridged(without_some, monkeypatch, change):
     job, _ = without_some
     monkeypatch.setattr(xfeat_weights, "are_installed", lambda: True)
