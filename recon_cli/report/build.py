@@ -159,7 +159,8 @@ def _template_values(
         "export": stages["export"].read_summary(ExportSummary), "room": read_room(stages["export"]),
         "longest": max(run.seconds for run in runs),
         "largest": max(run.peak_memory_bytes for run in runs),
-        "icon": ICON, "gain": ERROR_GAIN, "most_error": MOST_ERROR, "stops": ", ".join(legend_stops()),
+        "icon": ICON, "gain": ERROR_GAIN, "most_error": MOST_ERROR,
+        "stops": ", ".join(legend_stops()),
     }
 
 

@@ -46,7 +46,7 @@ MIN_RAY_ANGLE_DEG = 1.5
 # The median of these angles in a model: 7 to 23 in good captures, 3.9 in one that failed.
 MIN_PARALLAX_DEG = 2.0
 # Scale of Cauchy's loss, times the mean error. Cameras of two rooms came out at .54 and .47 cm
-# without it, at .34 and .19 without what is OUTLIER_SIGMAS off (`mapper`), at .16 and .09 with both.
+# without it, at .34 and .19 without what is OUTLIER_SIGMAS off (mapper), at .16 and .09 with both.
 LOSS_SCALE = 0.5
 
 # --- models
