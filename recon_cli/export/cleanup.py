@@ -37,6 +37,7 @@ from recon_cli.render.depth_loss import LEAST_COVERAGE
 from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import EXTENT_SIGMAS, Splats
+from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.values import measure_distances, measure_extent
 
@@ -44,7 +45,6 @@ _NEIGHBOURS = 16  # compared with each; a surface around a Gaussian has about si
 _APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
 _OUTSIDE = 0.005  # of the Gaussians: a group is small, or lies beyond a side of the scene's box
 # Measurements behind these constants: tests/bench/notes/scenes.md.
-_FEW = 2  # views
 _IN_FRONT = 0.5  # of the depth of the surface behind
 _HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
 _FAINT = 0.1  # opacity; without views only such a large Gaussian counts as haze
@@ -218,7 +218,7 @@ def _find_in_front(
     on_view: Callable[[], None],
 ) -> Tensor:
     """Returns which Gaussians are in front of the few views that see them, [N] bool."""
-    few = (seen_by > 0) & (seen_by <= _FEW)
+    few = (seen_by > 0) & (seen_by < MIN_OBSERVATIONS)
     in_front = few.clone()
     rest = splats.select(~few)
     if not few.any() or not len(rest):

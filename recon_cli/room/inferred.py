@@ -25,6 +25,7 @@ from recon_cli.room.planes import LEAST_COSINE, Plane, find_planes
 from recon_cli.room.texture import draw_mesh
 from recon_cli.room.texture_kernels import draw
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.statistics import MOST_MAPS
 
 _NEAR = 6.0  # voxels, within which a bump is not a hole
 _ACROSS = 0.2  # cosine between planes that meet, at most
@@ -35,7 +36,6 @@ _AROUND = 80  # cells, within which what surrounds a hole lies in each of eight 
 _MARGIN = 40  # cells around the surface of a plane, to the lines in which it meets others
 _AGREE = 0.05  # of a depth, within which a view shows the plane, not what lies behind it
 _MOST_CROSSED = 0.1  # share of them and of those whose rays cross it, that may cross it
-_MOST_VIEWS = 100  # that are asked about a hole
 _LEAST_CELLS = 12  # of a hole
 _MOST_CELLS = 4_000_000  # of the grid of a plane
 
@@ -102,9 +102,9 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
 
 
 def _draw_depths(maps: DepthMaps, mesh: Mesh) -> list[_DepthView]:
-    """Returns up to `_MOST_VIEWS` of the maps, evenly spread, and the mesh in them."""
+    """Returns up to `MOST_MAPS` of the maps, evenly spread, and the mesh in them."""
     rows = np.unique(np.linspace(
-        0, len(maps.cameras) - 1, min(len(maps.cameras), _MOST_VIEWS)).round().astype(int))
+        0, len(maps.cameras) - 1, min(len(maps.cameras), MOST_MAPS)).round().astype(int))
     return [_DepthView(maps.cameras[row], maps.depths[row], draw_mesh(
         maps.cameras[row], mesh.vertices, mesh.faces).nearness) for row in rows]
 

@@ -21,7 +21,7 @@ from recon_cli.room.charts import GRAZING, Charts, make_charts
 from recon_cli.room.mesh_planes import vertex_normals
 from recon_cli.room.texture_kernels import COLUMNS, GAIN, WEIGHT, bake, draw, shade
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.statistics import LEAST_SHARED, UNCLIPPED
+from recon_cli.scene.statistics import LEAST_SHARED, REFIT_ROUNDS, UNCLIPPED
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo.depths import EDGE, camera_row
 
@@ -34,7 +34,6 @@ MOST_PIXELS = 50_000_000  # of all photos; 11 bytes of each are in memory
 TOLERANCE = 0.025  # of a depth, within which a view shows a texel or vertex
 _FEATHER = 6  # pixels within which a view fades towards what hides a surface
 _SAMPLES = 6000  # vertices by which photos are compared
-_ROUNDS = 4  # of that comparison
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +247,7 @@ def _offsets(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     used = known.sum(axis=1) >= LEAST_SHARED
     if not used.any():
         return offsets
-    for _ in range(_ROUNDS):
+    for _ in range(REFIT_ROUNDS):
         shared = np.nanmedian(logs - offsets[:, None], axis=0)
         offsets[used] = np.nanmedian(logs[used] - shared, axis=1)
         offsets[used] -= offsets[used].mean(axis=0)

@@ -19,6 +19,7 @@ from recon_cli.scene.similarity import Similarity
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant basis function
 EXTENT_SIGMAS = 3.0  # standard deviations of a Gaussian within which nearly all of it lies
 LEAST_OPACITY = 1e-6  # far below 1/255, and its logit is finite in float32
+MOST_OPACITY = 0.999  # likewise
 TERMS = (0, 3, 8, 15)  # coefficients a channel after the constant one, by degree
 
 

@@ -18,6 +18,8 @@ LEAST_SAMPLE = 100  # points, of which fewer decide nothing
 # Samples that two views must share: their median is known to a fifth of their spread.
 LEAST_SHARED = 40
 UNCLIPPED = (12, 243)  # of 255, of a mean over some pixels, of which some may be clipped beyond
+REFIT_ROUNDS = 4  # of weights, of a fit that outliers are to leave alone
+MOST_MAPS = 100  # depth maps that surfaces are looked up in, evenly spread
 ROUNDING = 1e-6  # relative: what float32 leaves of a value, and two machines may differ by
 
 

@@ -8,6 +8,7 @@ scored: they are painted in one colour in truth/ and black in difference/.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,7 +70,6 @@ from recon_cli.workspace.atomic import write_json, write_text
 from recon_cli.workspace.records import Frame, ImportRecord, describe_stretches, read_frame_list
 from recon_cli.workspace.summaries import EvaluateSummary, WorldSummary
 
-_ANY_ITERATION = 1 << 62  # beyond the last
 _SEEN_VIEWS = 20  # training and validation views that are also scored, at most
 _STAGES = {"base": "train", "pruned": "prune"}  # by model
 _ROOM = 512 << 20  # bytes of images that trust need not render again: 130 views of 600x340
@@ -135,7 +135,7 @@ class _Evaluation:
                             falloffs=falloffs, on_view=seen)
             for name, views in self.training_views.items()}
         log = self.folders[model] / LOG
-        seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
+        seconds = None if self.import_record else seconds_at(log, sys.maxsize)
         return ModelMetrics.from_views(
             scores.views, gaussians=len(splats),
             bytes=(self.folders[model] / "splats.ply").stat().st_size,

@@ -22,11 +22,10 @@ from recon_cli.io.depth_maps import (
     read_sure_depth,
 )
 from recon_cli.io.images import read_png
-from recon_cli.scene.statistics import LEAST_WITNESSES
+from recon_cli.scene.statistics import LEAST_WITNESSES, MOST_MAPS
 from recon_cli.scene.voxels import SURFACE_CELL, number_cells
 from recon_cli.sfm.model_arrays import registered_images
 
-MOST_MAPS = 100  # evenly spread
 SAMPLES = 8000  # of each map
 
 

@@ -25,7 +25,7 @@ from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import (
     COARSEST_KEYPOINTS,
     MIN_CONFIRMED,
-    MIN_SPOT_AGREEING,
+    MIN_PAIR_EXPLAINED,
     MIN_SPOT_MATCHES,
 )
 from recon_cli.sfm.mapping import checks, fallbacks, mapper, parts
@@ -75,7 +75,7 @@ def match_known(job: MappingJob, report: Reporter) -> MatchesResult:
             tracked_poses.match_overlapping(job, rest, report)
             found = matching.count_matches(job)
         elif job.pose_use == "refine":
-            raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
+            raise _misfit(check.share or 0.0, MIN_PAIR_EXPLAINED)
         else:
             found = fallbacks.match_first(job, report)
         return replace(found, poses_share=check.share, poses_contradicted=check.contradicted)
@@ -121,7 +121,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     matched = StepFolder(job.out).find("matches", MatchesResult)
     assert matched is not None, "matches come before the model"
     share = matched.poses_share
-    if share is None or share >= MIN_SPOT_AGREEING:
+    if share is None or share >= MIN_PAIR_EXPLAINED:
         checks.check_registered(job.names, list(known.viewmats), 0.0)
         report.phase("mapping", len(job.names))
         try:
@@ -133,7 +133,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
         matching_again = fallbacks.list_fallbacks(job)[0].choose_pairs(job, report)
         matching.match_pairs(job, matching_again, report)
     else:
-        reason = _misfit(share, MIN_SPOT_AGREEING).message
+        reason = _misfit(share, MIN_PAIR_EXPLAINED).message
     found = fallbacks.build_model(job, report)
     return replace(
         found, notes=(f"{reason} The cameras were found from the pictures alone.", *found.notes),
@@ -187,7 +187,7 @@ def _check_some(job: MappingJob, known: KnownPoses) -> SpotCheck:
     """Returns how well sampled images agree with the poses; SfmError if they do not."""
     check = spot_check(job, known.viewmats)
     if not check.fits:
-        raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
+        raise _misfit(check.share or 0.0, MIN_PAIR_EXPLAINED)
     return check
 
 
@@ -307,7 +307,7 @@ class SpotCheck:
     @property
     def fits(self) -> bool:
         """Whether the poses can be used."""
-        return self.share is None or self.share >= MIN_SPOT_AGREEING
+        return self.share is None or self.share >= MIN_PAIR_EXPLAINED
 
     def describe(self) -> str:
         """Returns a sentence for the terminal."""

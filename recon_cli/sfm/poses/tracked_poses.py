@@ -25,8 +25,8 @@ from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.limits import (
     LOOP_CANDIDATES,
     MAX_ERROR_PX,
+    MIN_PAIR_EXPLAINED,
     MIN_POSE_INLIERS,
-    MIN_SPOT_AGREEING,
     MIN_SPOT_MATCHES,
 )
 from recon_cli.sfm.mapping import mapper
@@ -66,7 +66,7 @@ class PosesCheck:
     @property
     def fits(self) -> bool:
         """Whether the poses may be a start."""
-        return self.share is None or self.share >= MIN_SPOT_AGREEING
+        return self.share is None or self.share >= MIN_PAIR_EXPLAINED
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ def match_near(job: MappingJob, viewmats: Viewmats, report: Reporter) -> PosesCh
     share = agreeing.total() / matches.total() if total >= MIN_SPOT_MATCHES else None
     return PosesCheck(total, share, tuple(
         name for name in sorted(matches) if matches[name] >= MIN_SPOT_MATCHES
-        and agreeing[name] < MIN_SPOT_AGREEING * matches[name]))
+        and agreeing[name] < MIN_PAIR_EXPLAINED * matches[name]))
 
 
 def match_overlapping(
