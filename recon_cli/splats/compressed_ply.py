@@ -170,7 +170,7 @@ def load_compressed_ply(path: Path) -> LoadedScene:
     if not n or len(chunk) != -(-n // AT_ONCE):
         raise FormatError(f"{path} has {len(chunk)} chunks of {AT_ONCE} for {n} Gaussians.")
     place, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
-    shares = _split_bits(color >> 8, (8, 8, 8))
+    shares = _split_bits(color >> np.uint32(8), (8, 8, 8))
     colors = _interpolate(chunk, _COLOR, shares) if colored else shares
     columns = drop_not_finite(path, {
         "means": _interpolate(chunk, _PLACE, _split_bits(place, _BITS)),
