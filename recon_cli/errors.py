@@ -18,6 +18,7 @@ from typing import ClassVar
 IN_USE = "RECON_IN_USE"
 WITHOUT_WORKSPACE = ("batch", "bench", "convert", "info", "setup", "study")
 
+MOST_CHARACTERS = 200  # of a value or path that a message repeats
 MOST_NAMED = 5  # things that a message lists, where a record or a log has all
 
 

@@ -15,7 +15,9 @@ from typing import Protocol
 
 from tqdm import tqdm
 
-RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
+# Between two records of how far something is: a person sees no difference, a flush to disk and a
+# sample of all children cost nothing so seldom.
+RECORD_SECONDS = 0.5
 LINE_SECONDS = 20.0  # between two lines of a stage
 
 logger = logging.getLogger("recon.progress")

@@ -20,11 +20,11 @@ from recon_cli.capture.frame_selection import MEANINGS, FrameCandidate, Reason, 
 from recon_cli.workspace import atomic
 
 SHEET = "contact.png"
-MAX_PIXELS = 4_500_000  # 2000x2250; usually 1.1 MB
 MAX_BYTES = 3_000_000
 # Tried until the file is small enough; the last takes at most half a byte a pixel.
 PALETTES = (256, 64, 16)
 MAX_WIDTH = 2000  # pixels; two sheets side by side on a large screen
+MAX_PIXELS = MAX_WIDTH * 2250  # usually 1.1 MB
 THUMB_PIXELS = 14_000  # 158x89 at 16:9
 # Kept frames get at most this share of the cells, to leave room for dropped ones.
 KEPT_SHARE = 0.65

@@ -43,7 +43,7 @@ from recon_cli.capture.video_colour import (
 )
 
 # Players take untagged video of more than standard definition as BT.709 (mpv: csputils.c).
-SD_WIDTH, SD_HEIGHT = 1280, 576
+SD_SIZE = (1280, 576)
 # Without these, swscale truncates, and repeats chroma instead of interpolating it. Frames of a
 # rendered video: 1.0 of 255 too dark and 38.4 dB; with these 0.1 and 39.0 dB, 1.6 times the cost.
 ROUNDED = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
@@ -298,7 +298,7 @@ class DecodedPicture:
         """Returns the matrix that players take where the frame names none."""
         if self.tags.transfer is not None or self.tags.primaries == BT2020:
             return Colorspace.BT2020
-        large = self.frame.width >= SD_WIDTH or self.frame.height > SD_HEIGHT
+        large = self.frame.width >= SD_SIZE[0] or self.frame.height > SD_SIZE[1]
         return Colorspace.ITU709 if large else Colorspace.ITU601
 
     def _white(self) -> int:

@@ -10,19 +10,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.capture.limits import MEASURE_SIZE, MIN_TRACKS, RETURN_ERROR, WINDOW
+from recon_cli.capture.limits import MEASURE_SIZE, MIN_TRACKS, RETURN_ERROR, TRACK_SIZE, WINDOW
 from recon_cli.errors import InputError
 
 Value = TypeVar("Value", np.uint8, np.float32)
 
-TRACK_WIDTH = 320  # pixels; wide enough for corners, small enough for 5 ms a frame
+TRACK_WIDTH = TRACK_SIZE // 2  # pixels; wide enough for corners, small enough for 5 ms a frame
 ANCHOR_REACH = 0.03  # of the width, about 10 px: still well inside the tracker's basin
 # Corners as in Shi and Tomasi; their spacing spreads 300 of them over the frame.
 MAX_CORNERS, CORNER_QUALITY, CORNER_SPACING = 300, 0.005, 6
-# Windows of 15 px on 4 pyramid levels follow about 40 px at this width.
-LEVELS = 3
 # Gray values of 8 bits; a codec moves true black and white by a few.
-BLACK, BLOWN_OUT = 16, 250
+UNCLIPPED = (16, 250)
 # More than this and the frame is clipped: it is avoided where neighbours are better.
 MOST_CLIPPED = 0.5
 # More than this and nothing in the frame can be matched: it is never chosen.
@@ -94,10 +92,11 @@ class MotionMeter:
         self.followed = 0.0
         if self._corners is None or len(self._corners) < MIN_TRACKS:
             return float("nan")
+        # on four levels of a pyramid, as OpenCV has it, windows follow about 40 px at this width
         tracked, forward, _ = cv2.calcOpticalFlowPyrLK(
-            self._anchor, small, self._corners, None, winSize=WINDOW, maxLevel=LEVELS)
+            self._anchor, small, self._corners, None, winSize=WINDOW)
         returned, backward, _ = cv2.calcOpticalFlowPyrLK(
-            small, self._anchor, tracked, None, winSize=WINDOW, maxLevel=LEVELS)
+            small, self._anchor, tracked, None, winSize=WINDOW)
         # Tracking a corner back must end where it began; on a blank wall the tracker slides.
         error = np.linalg.norm((returned - self._corners).reshape(-1, 2), axis=1)
         good = (forward & backward)[:, 0].astype(bool) & (error <= RETURN_ERROR)
@@ -115,7 +114,8 @@ def measure_exposure(gray: NDArray[np.uint8]) -> tuple[float, float, float]:
     """
     few = gray[::EVERY, ::EVERY]
     areas = cv2.resize(gray, (AREAS, AREAS), interpolation=cv2.INTER_AREA)
-    return float(np.mean(few <= BLACK)), float(np.mean(few >= BLOWN_OUT)), float(areas.std())
+    black, blown_out = few <= UNCLIPPED[0], few >= UNCLIPPED[1]
+    return float(np.mean(black)), float(np.mean(blown_out)), float(areas.std())
 
 
 def well_exposed(exposures: NDArray[np.float64]) -> NDArray[np.bool_]:  # [F]

@@ -57,14 +57,12 @@ from recon_cli.errors import MOST_NAMED, FormatError, InputError, ManifestError,
 from recon_cli.io.images import fit_image, fit_size, read_png, write_png
 from recon_cli.io.tracks import Tracks
 from recon_cli.scene.camera import panorama_lens
+from recon_cli.scene.matches import EXHAUSTIVE_MAX
 from recon_cli.workspace import atomic
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group
 
 PLAN = "raw.json"  # how camera RAW was developed, for the next run and for inspection
-# Frames that are kept of any folder, however little the camera moves: somebody may have picked
-# them, and all pairs of so many are matched in minutes.
-MIN_KEPT = 100
 Record = tuple[FrameCandidate, ...]  # what became of every photo, in order
 
 
@@ -241,7 +239,7 @@ def _choose_followed(
     dense = is_dense([source.photos[place] for place in sequence.places])
     count = config.frames or frame_selection.automatic_count(
         frame_selection.path_length(sequence.scan.motion), most=config.max_frames,
-        least=MIN_KEPT if dense else len(sequence.places))
+        least=EXHAUSTIVE_MAX if dense else len(sequence.places))
     video = judge(config, source.path, sequence.scan, ctx, least=count)
     chosen = frame_selection.choose_frames(
         video.lengths, video.scan.sharpness, video.distinct, count,

@@ -28,12 +28,13 @@ from recon_cli.config.stages import IngestConfig
 from recon_cli.errors import InputError
 from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.scene.camera import panorama_lens
+from recon_cli.scene.statistics import at_least
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import Frame, Group
 
 SCAN = "scan.json"  # a scan for the next run; the prefix of the video's frames comes before it
-# A count by the duration may be off by this much, as a share or in frames, without any loss.
-COUNT_SHARE, COUNT_FRAMES = 0.02, 10
+# A count by the duration may be off by so many frames, or this share of all, without any loss.
+INEXACT_COUNT = (10, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +200,7 @@ def _report_lost(path: Path, scan: Scan, ctx: IngestContext) -> None:
             f"{path} has {intact} undamaged frames of {scan.expected}, but at least "
             f"{store.MIN_FRAMES} are needed.",
             hint="Give a longer video, or copy it from the camera again if it should be longer.")
-    inexact = max(COUNT_SHARE * scan.declared, COUNT_FRAMES)
+    inexact = at_least(INEXACT_COUNT, scan.declared)
     if intact < decoded or scan.gaps or scan.lost > inexact:
         ctx.notice(
             f"{path.name} is damaged or cut off: {scan.lost} of {scan.expected} frames are lost, "

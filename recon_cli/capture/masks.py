@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from recon_cli.capture.images import PHOTO_SUFFIXES, RAW_SUFFIXES, Photo, read_alpha, read_rgb
 from recon_cli.errors import InputError
+from recon_cli.io.images import HALF
 from recon_cli.workspace import atomic
 
-HALF = 128  # from this value on a pixel is white, or opaque
 MASK_FOLDERS = ("masks", "mask", ".mask")
 _LAYER = ".mask"  # before the suffix of a mask
 _SUFFIXES = PHOTO_SUFFIXES - RAW_SUFFIXES - {".jxl"}

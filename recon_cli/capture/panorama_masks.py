@@ -28,7 +28,7 @@ MIN_PANORAMAS = 15  # fewer look alike by chance
 # that. Where an operator stands in two rooms it is .1 to .31, of a video .08; the lowest two
 # thousandths elsewhere are .3 and .42 there, and .43 in a house without one. To compare with the
 # median of all panoramas instead would not tell a lit operator from the room.
-CARRIED, ADJOINING = 0.25, 0.32
+CARRIED = (0.25, 0.32)
 LEAST = 60  # pixels of an area that is masked
 HIGHEST_DEG = 30.0  # above the horizon; ceilings are even
 GROW = 4  # pixels around it: cameras lean by some degrees
@@ -85,9 +85,9 @@ def find_carried(
     share[hidden] = np.inf
     share[:round((90 - HIGHEST_DEG) / 180 * SIZE[1])] = np.inf
     # twice beside itself, so that an area across the seam is one
-    near = np.concatenate([share, share], axis=1) < ADJOINING
+    near = np.concatenate([share, share], axis=1) < CARRIED[1]
     count, labels = cv2.connectedComponents(near.astype(np.uint8))
-    sure = np.concatenate([share, share], axis=1) < CARRIED
+    sure = np.concatenate([share, share], axis=1) < CARRIED[0]
     seeds = np.bincount(labels[sure], minlength=count)
     seeds[0] = 0
     found = np.asarray((seeds >= LEAST)[labels], np.bool_)

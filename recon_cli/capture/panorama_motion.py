@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon_cli.io.tracks import Tracks
+from recon_cli.scene.statistics import OUTLIER_SIGMAS
 
 # Degrees that count as the width of an ordinary picture, by which frames are spaced.
 WIDTH_DEG = 65.0
 REACH = 0.05  # widths; so far from an anchor, the next frame becomes one
 LEAST_CORNERS = 12
 ROUNDS = 3  # of the fit, without what lies far off it
-OFF = 3.0  # times the median
 
 
 def measure_parallax(tracks: Tracks) -> NDArray[np.float64]:  # [F]
@@ -49,7 +49,7 @@ def _parallax(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
         turn, _ = Rotation.align_vectors(after[near], before[near])
         cosines = (turn.apply(before) * after).sum(axis=1)
         angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-        near = angles <= max(OFF * float(np.median(angles)), 1e-6)
+        near = angles <= max(OUTLIER_SIGMAS * float(np.median(angles)), 1e-6)
         if np.count_nonzero(near) < LEAST_CORNERS:
             break
     return float(np.median(angles))

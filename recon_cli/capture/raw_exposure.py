@@ -16,24 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from recon_cli.capture.limits import MAX_RATIO, MOST_FEATURES
+from recon_cli.capture.limits import MOST_FEATURES
+from recon_cli.scene.matches import MAX_RATIO
+from recon_cli.scene.statistics import FINE_SAMPLE, LEAST_WITNESSES
 
 # Standard deviation of the difference that a pair gives, over 77 pairs of 40 photos of a desk.
 PAIR_EV = 0.022
 # Beyond this, EXIF is rejected. Light that changed by itself (a phone's own exposure left in
 # the pixels) bent pairs by 0.25 EV (standard deviation); a wrong EXIF is off by a stop and more.
 DOUBT_EV = 0.5
-MIN_WITNESSES = 2  # pairs needed to reject an EXIF value
 LOOSE_EV = 3.0  # keeps photos of unknown exposure near the others
 REACH = 4  # each photo is compared with so many that follow
-PIXELS_KEPT = 20_000  # of each photo, enough for a percentile
 MIN_DISTINCT = 20  # below this, repeated things can agree on a geometry by chance
 EPIPOLAR_PIXELS = 1.5  # of the small view: room for a lens that is not undistorted
 # Between the quartiles of a pair's ratios: at most 0.43 EV over 40 pairs of a rendered room that
 # overlap well, at least 0.6 EV, mostly above 1, over the 14 whose matches were chance.
 AGREED_EV = 0.5
 # Linear values, as shares of saturation, between which noise and clipping do not distort a ratio.
-DARK, BRIGHT = 0.004, 0.9
+USABLE = (0.004, 0.9)
 
 Pairs = Mapping[tuple[int, int], float]  # by how many EV the second photo is brighter
 
@@ -61,7 +61,7 @@ def measure_view(
     keys, sift = cv2.SIFT.create(nfeatures=MOST_FEATURES).detectAndCompute(_visible(linear), None)
     descriptors = np.empty((0, 128), np.uint8) if sift is None else sift.astype(np.uint8)
     brightest = np.where(clipped, np.inf, linear.max(axis=2)).astype(np.float32).ravel()
-    sample = np.linspace(0, len(brightest) - 1, min(PIXELS_KEPT, len(brightest))).astype(int)
+    sample = np.linspace(0, len(brightest) - 1, min(FINE_SAMPLE, len(brightest))).astype(int)
     points = np.array([key.pt for key in keys], np.float32).reshape(-1, 2)
     return RawMeasures(points, descriptors, _levels(linear, clipped, points), brightest[sample])
 
@@ -97,7 +97,7 @@ def drop_contradicted(nominal: Sequence[float | None], pairs: Pairs) -> list[flo
                 errors.setdefault(a, []).append(apart - bright + dark)
         doubts = {
             photo: abs(float(np.median(off)))
-            for photo, off in errors.items() if len(off) >= MIN_WITNESSES}
+            for photo, off in errors.items() if len(off) >= LEAST_WITNESSES}
         worst = max(doubts, key=doubts.__getitem__, default=None)
         if worst is None or doubts[worst] < DOUBT_EV:
             return known
@@ -187,5 +187,5 @@ def _levels(
     at = points.round().astype(int)
     x, y = (np.clip(at[:, k], 0, green.shape[1 - k] - 1) for k in (0, 1))
     value = green[y, x].astype(np.float64)
-    usable = (value > DARK) & (value < BRIGHT) & ~near_clipped[y, x]
-    return np.where(usable, np.log2(np.maximum(value, DARK)), np.nan)
+    usable = (value > USABLE[0]) & (value < USABLE[1]) & ~near_clipped[y, x]
+    return np.where(usable, np.log2(np.maximum(value, USABLE[0])), np.nan)

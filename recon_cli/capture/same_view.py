@@ -29,7 +29,7 @@ SAME_VIEW = 0.05
 # A curve must explain as much of the distance: a camera that moves a little is no exposure.
 EXPLAINED = 0.5
 # Of 255: beyond these a sensor or a file keeps no differences, and no curve brings them back.
-DARKEST, BRIGHTEST = 4, 252
+UNCLIPPED = (4, 252)
 LEAST_COMMON = 0.05  # of the reduced photo, clipped in neither
 # Correlation by rank of two reduced photos: only above it a curve is fitted, which takes a
 # millisecond. Brackets of which three quarters are clipped reach .75.
@@ -55,7 +55,7 @@ def measure_photo(rgb: NDArray[np.uint8]) -> PhotoMeasures:
     """Returns the measures of a photo, [H, W, 3], that the selection needs."""
     gray = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     green = rgb[..., 1]  # not a sum of channels, of which each has its own curve and limit
-    beyond = (green <= DARKEST) | (green >= BRIGHTEST)
+    beyond = (green <= UNCLIPPED[0]) | (green >= UNCLIPPED[1])
     small, share = (
         cv2.resize(each.astype(np.float32), (SIDE, SIDE), interpolation=cv2.INTER_AREA).ravel()
         for each in (green, beyond))

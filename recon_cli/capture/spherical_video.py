@@ -20,8 +20,7 @@ from recon_cli.errors import InputError
 _PROJECTIONS = {
     0: "equirectangular", 1: "cubemap", 2: "equirectangular tile", 3: "half equirectangular",
     5: "fisheye", 6: "parametric immersive"}
-# Frames that are looked at, and how many of them must wrap around.
-_LOOKED_AT, _EVERY, _LEAST = 5, 40, 3
+_LOOKED_AT, _EVERY = 5, 40  # frames that are looked at, of which most must wrap around
 # What cameras with two fisheye lenses write, and who stitches that.
 _STITCHERS = {
     ".insv": "Insta360 Studio", ".360": "GoPro Player", ".osv": "DJI Studio"}
@@ -96,7 +95,7 @@ def is_spherical(
     chosen = {index for index in range(0, _LOOKED_AT * _EVERY, _EVERY) if index < frames}
     around = [wraps_around(rgb) for _, rgb in video.frames_at(
         path, chosen, threads=1, size=size)]
-    return sum(around) >= min(_LEAST, len(around))
+    return sum(around) >= min(_LOOKED_AT // 2 + 1, len(around))
 
 
 def read_projection(path: Path) -> str:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.capture.frame_measures import shrink
-from recon_cli.capture.limits import MAX_RATIO, MIN_MATCHES, MOST_FEATURES, TRACK_SIZE
+from recon_cli.capture.limits import MOST_FEATURES, TRACK_SIZE
+from recon_cli.scene.matches import MAX_RATIO, MIN_PAIR_INLIERS
 
 REACH = 2.0  # pixels between a feature and the epipolar line of its match
 MOST_COMPARED = 80  # pictures that one is compared with, spread evenly
@@ -42,8 +43,8 @@ def find_strangers(suspects: Collection[int], others: Collection[int], read: Rea
         known = dict.fromkeys([*nearest[:4], *nearest[::max(1, len(nearest) // MOST_COMPARED)]])
         own = features(suspect)
         if own is not None and not any(
-                (other := features(index)) is not None and count_agreeing(own, other) >= MIN_MATCHES
-                for index in known):
+                (other := features(index)) is not None
+                and count_agreeing(own, other) >= MIN_PAIR_INLIERS for index in known):
             strangers.append(suspect)
     return strangers
 
@@ -72,10 +73,10 @@ def match_features(
 
 def count_agreeing(first: _Features, second: _Features) -> int:
     """Returns how many features of two pictures match under one epipolar geometry."""
-    if min(len(first.xy), len(second.xy)) < MIN_MATCHES:
+    if min(len(first.xy), len(second.xy)) < MIN_PAIR_INLIERS:
         return 0
     start, end = match_features(first, second)
-    if len(start) < MIN_MATCHES:
+    if len(start) < MIN_PAIR_INLIERS:
         return 0
     _, inside = cv2.findFundamentalMat(start, end, cv2.FM_RANSAC, REACH, 0.999, 2000)
     return 0 if inside is None else int(inside.sum())

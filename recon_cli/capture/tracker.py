@@ -28,7 +28,7 @@ CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.03)
 # Mean difference of the gray values in a window. 90% of the corners of four videos stay below 6 to
 # 16; of the few that find something alike beyond a cut, half are above it.
 MAX_DIFFERENCE = 25.0
-MARGIN = 3  # pixels at the border, where windows are cut off
+MARGIN = BLOCK // 2  # pixels at the border, where windows are cut off
 MERGED = 4  # pixels; of two tracks in one cell of this size the older is kept
 # Exposure changes from frame to frame; contrast by areas takes that off (CLAHE).
 CLIP_LIMIT = 2.0

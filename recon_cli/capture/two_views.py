@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from recon_cli.capture.decoded_picture import Packing
 from recon_cli.capture.frame_measures import shrink
 from recon_cli.capture.lens_border import LensCircle, fit_circle
-from recon_cli.capture.limits import MIN_MATCHES, TRACK_SIZE
+from recon_cli.capture.limits import TRACK_SIZE
 from recon_cli.capture.strangers import find_features, match_features
+from recon_cli.scene.matches import MIN_PAIR_INLIERS
 
 # Of a half's sides: by how much the middle of a fisheye's circle may miss that of its half.
 OFF_CENTRE = 0.1
 # Between the views of two eyes nothing moves up or down by more than this share of the height, and
 # to the side by no more than that of the width: a thing at arm's length, eyes 65 mm apart.
-RAISED, PARALLAX = 0.02, 0.2
+PARALLAX = (0.2, 0.02)
 SAME = 0.2  # of the features of a view: those that its twin shows in the same place
 
 
@@ -68,14 +69,14 @@ def _shows_twice(rgb: NDArray[np.uint8], axis: int) -> bool | None:
     first, second = (find_features(half) for half in _halves(
         np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8), axis))
     fewer = min(len(first.xy), len(second.xy))
-    if fewer < MIN_MATCHES:
+    if fewer < MIN_PAIR_INLIERS:
         return None if fewer == len(first.xy) == len(second.xy) == 0 else False
     height, width = rgb.shape[0], rgb.shape[1]
     sides = np.array([width / 2, height] if axis else [width, height / 2])
     start, end = match_features(first, second)
     apart = np.abs(end - start) / sides
-    same = int((apart <= [PARALLAX, RAISED]).all(axis=1).sum())
-    return same >= max(MIN_MATCHES, SAME * fewer)
+    same = int((apart <= PARALLAX).all(axis=1).sum())
+    return same >= max(MIN_PAIR_INLIERS, SAME * fewer)
 
 
 def _halves(pixels: NDArray[np.uint8], axis: int) -> list[NDArray[np.uint8]]:

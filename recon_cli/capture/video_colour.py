@@ -36,14 +36,14 @@ PQ_C1 = PQ_C3 - PQ_C2 + 1
 # white of DCI P3 is that of projectors, which a display adapts to its own.
 BT709, BT2020 = ColorPrimaries.BT709, ColorPrimaries.BT2020
 DCI_P3, P3 = ColorPrimaries.SMPTE431, ColorPrimaries.SMPTE432
+# Adobe RGB (1998) Color Image Encoding, 4.3.1: beyond the codes of H.273, which are bytes.
+ADOBE_RGB, ADOBE_GAMMA = 256, 563 / 256
 PRIMARIES: dict[int, tuple[tuple[float, float], ...]] = {
     BT709: ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06)),
     BT2020: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
-    P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))}
+    P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
+    ADOBE_RGB: ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))}
 PRIMARIES[DCI_P3] = PRIMARIES[P3]
-# Adobe RGB (1998) Color Image Encoding, 4.3.1: beyond the codes of H.273, which are bytes.
-ADOBE_RGB, ADOBE_GAMMA = 256, 563 / 256
-PRIMARIES[ADOBE_RGB] = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))
 WIDE_GAMUTS: dict[int, str] = {
     BT2020: "BT.2020", DCI_P3: "P3", P3: "Display P3", ADOBE_RGB: "Adobe RGB"}
 D65 = (0.3127, 0.3290)

@@ -14,6 +14,7 @@ from recon_cli.commands import options
 from recon_cli.commands.console import say
 from recon_cli.commands.options import Call, Command, Verb, pass_call
 from recon_cli.config import settings
+from recon_cli.config.protocols import STEPS
 from recon_cli.config.settings import Settings
 from recon_cli.config.stages import ComputeConfig
 from recon_cli.progress import TqdmProgress
@@ -176,7 +177,7 @@ def _fill_paper_tables(
         typed_in = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
         return given if typed_in else default
 
-    typed["iterations"] = choose("iterations", typed["iterations"], rooms.ITERATIONS)
+    typed["iterations"] = choose("iterations", typed["iterations"], STEPS)
     typed["seeds"] = choose("seeds", typed["seeds"], 1)
     found = SceneOptions(
         (*rooms.find_rooms(replica), *scenes.paths),

@@ -14,9 +14,8 @@ from functools import cache
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from recon_cli.errors import ConfigError, ReconError
+from recon_cli.errors import MOST_CHARACTERS, ConfigError, ReconError
 
-_SHOWN = 100  # characters of a value
 MOST = 2**31 - 1  # of any integer: the limit of COLMAP and others
 
 
@@ -129,7 +128,7 @@ class StageConfig:
 
     def _error(self, name: str, value: object, needed: str) -> ConfigError:
         return ConfigError(
-            f"{name} is {repr(value)[:_SHOWN]}, but it must be {needed}.",
+            f"{name} is {repr(value)[:MOST_CHARACTERS]}, but it must be {needed}.",
             hint=f"Change --{name.replace('_', '-')} or {name} in recon.toml.")
 
     @property

@@ -21,6 +21,7 @@ from recon_cli.errors import FormatError
 from recon_cli.io.calibration import undistort_pixels
 from recon_cli.io.depth_maps import LEAST_POINTS, MEDIAN, MOST_NOISE
 from recon_cli.scene.camera import Lens
+from recon_cli.scene.statistics import LEAST_SAMPLE, MIN_OBSERVATIONS, robust_sigma
 
 # Units of a stored value, in metres: what cameras and data sets write.
 _UNITS = {
@@ -29,13 +30,11 @@ _UNITS = {
 # Neighbouring units are 25% apart, so that a scale this near to one is near to no other.
 _FITS = 0.1
 _SURE = _FITS / 2  # standard error of the logarithm of a scale: two of them stay within _FITS
-_LEAST_ESTIMATES = 3  # whose scatter tells anything
 _STARTS, _RANKS = 12, 7  # images that are compared, with the 1st, 2nd, 4th to 64th nearest others
 # Pairs whose cameras are apart by these shares of the depth, and look alike: of less a phone's
 # error of a centimetre is too large a part, and beyond it little is seen by both.
-_LEAST_MOVED, _MOST_MOVED, _MOST_TURNED_DEG = 0.2, 1.0, 40.0
+_MOVED, _MOST_TURNED_DEG = (0.2, 1.0), 40.0
 _GRID = 40  # samples a side of a depth map
-_FEWEST = 100  # samples of a pair that both see
 _STEPS, _FINE = 9, np.geomspace(0.8, 1.25, 21)  # of the scales that are tried: 22%, then 2%
 # A scale shows, or is better than another one, if the other's error is this many times its own.
 CLEARLY_WORSE = 1.5
@@ -91,7 +90,7 @@ def fit_depth(
 
     sources = [_ask_pairs(viewmats, read, _AS_READ),
                [] if points is None else _ask_points(points, map(read, _spread(len(images))))]
-    sources = [estimates for estimates in sources if len(estimates) >= _LEAST_ESTIMATES]
+    sources = [estimates for estimates in sources if len(estimates) >= MIN_OBSERVATIONS]
     for estimates in sources:
         scale = _combine(estimates)
         if scale is not None and not _find_order(viewmats, read, _error(estimates, scale)):
@@ -131,8 +130,8 @@ def _combine(estimates: Sequence[_Estimate]) -> float | None:
     """Returns the median scale, None where the estimates are too far apart to be sure of it."""
     logs = np.log([estimate.scale for estimate in estimates])
     middle = float(np.median(logs))
-    # of the median of a normal distribution, by the median distance from it
-    spread = 1.2533 * 1.4826 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    # of the median of a normal distribution
+    spread = 1.2533 * robust_sigma(logs - middle) / np.sqrt(len(logs))
     scale = float(np.exp(middle))
     return scale if spread <= _SURE and _error(estimates, scale) <= MOST_NOISE else None
 
@@ -150,7 +149,7 @@ def _find_order(
         return ""
     for words, turn in _ORDERS.items():
         turned = _ask_pairs(viewmats, read, turn)
-        if len(turned) >= _LEAST_ESTIMATES and (scale := _combine(turned)) and _error(
+        if len(turned) >= MIN_OBSERVATIONS and (scale := _combine(turned)) and _error(
                 turned, scale) <= min(_GOOD, _CLEARLY * error):
             return f"it would fit the poses {words}"
     return ""
@@ -161,7 +160,7 @@ def compare_views(views: Sequence[DepthView]) -> float:
     viewmats = [view.viewmat for view in views]
     errors = []
     for at in _spread(len(views)):
-        least = _LEAST_MOVED * float(np.median(views[at].depth[views[at].depth > 0]))
+        least = _MOVED[0] * float(np.median(views[at].depth[views[at].depth > 0]))
         other = next(_list_partners(viewmats, at, least), None)
         if other is not None:
             errors += list(_compare(views[at], views[other], _AS_READ, np.ones(1)))
@@ -251,7 +250,7 @@ def _fit_pair(one: DepthView, other: DepthView, turn: Turn) -> _Estimate | None:
     """Returns the scale that fits a pair best, None if others fit it about as well."""
     moved = float(np.linalg.norm((other.viewmat @ np.linalg.inv(one.viewmat))[:3, 3]))
     scales = moved / float(np.median(one.depth[one.depth > 0])) * np.geomspace(
-        1 / _MOST_MOVED, 1 / _LEAST_MOVED, _STEPS)
+        1 / _MOVED[1], 1 / _MOVED[0], _STEPS)
     compare = partial(_compare, one, other, turn)
     best = scales[np.argmin(compare(scales))] * _FINE
     errors = compare(best)
@@ -287,7 +286,7 @@ def _compare(
     errors = np.full(len(scales), np.inf)
     for at, (expected, actual) in enumerate(zip(seen[..., 2], depths, strict=True)):
         known = actual > 0
-        if known.sum() >= max(1, min(_FEWEST, len(rows) // 4)):
+        if known.sum() >= max(1, min(LEAST_SAMPLE, len(rows) // 4)):
             errors[at] = np.median(np.abs(expected[known] / actual[known] - 1))
     return errors
 

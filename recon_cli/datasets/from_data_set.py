@@ -28,12 +28,12 @@ from recon_cli.errors import FormatError, InputError, format_count
 from recon_cli.io.depth_maps import write_depth, write_depth_list
 from recon_cli.io.images import fit_image, fit_size, write_png
 from recon_cli.io.views import spread_inside
+from recon_cli.scene.statistics import ROUNDING
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import MIN_FRAMES, Frame, Group, KnownPoses
 
 # Units between centres up to which all are one: of metres what a float32 rounds, of any other unit
 # nothing that a program would write.
-SAME_PLACE = 1e-6
 _PLAUSIBLE = (0.1, 20.0)  # metres; the median of depth over the frames of a room
 
 
@@ -82,7 +82,7 @@ def _ingest(
     posed = _write_depth(posed, readable, out, ctx)
     poses = None
     centers = np.linalg.inv([image.viewmat for _, image in readable])[:, :3, 3]
-    if np.ptp(centers, axis=0).max() <= SAME_PLACE:
+    if np.ptp(centers, axis=0).max() <= ROUNDING:
         ctx.notice("All poses stand in one place: the data set has turns alone, so the cameras are "
                    "found from the pictures.")
     else:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.datasets.frame_files import numbers, read_csv
+from recon_cli.scene.gravity import MAX_UP_SPREAD_DEG
 
 _COLUMNS = ("timestamp", "a_x", "a_y", "a_z")
 _FROM_DEVICE = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
@@ -23,8 +24,6 @@ _UNITS = (1.0, 9.81)  # lengths of gravity
 _OFF_UNIT = 0.15  # share by which the median length may miss them
 _WINDOW = 0.5  # seconds around a frame, over which steps of a walk average out
 _FEWEST = 10  # frames
-# Between the directions of single frames and their mean, in the median; and between two measures.
-UP_AGREES_DEG = 5.0
 _LEAST_TURN_DEG = 30.0  # between frames; with less, any axes would agree
 
 
@@ -39,7 +38,7 @@ class MeasuredUp:
     @property
     def is_sure(self) -> bool:
         """Whether frames that look different ways agree, so that axes and times must be right."""
-        return self.spread_deg <= UP_AGREES_DEG and self.turn_deg >= _LEAST_TURN_DEG
+        return self.spread_deg <= MAX_UP_SPREAD_DEG and self.turn_deg >= _LEAST_TURN_DEG
 
 
 def read_gravity(

@@ -27,14 +27,17 @@ from recon_cli.datasets.frame_files import (
     read_csv,
 )
 from recon_cli.datasets.frame_table import Y_UP, FrameTable, LeftOutError
-from recon_cli.datasets.phone_gravity import UP_AGREES_DEG, read_gravity
+from recon_cli.datasets.phone_gravity import read_gravity
 from recon_cli.datasets.posed import PosedImage, PosedSet
 from recon_cli.errors import FormatError, InputError
+from recon_cli.scene.gravity import MAX_UP_SPREAD_DEG
+from recon_cli.scene.statistics import at_least
 
 _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _IMU = "imu.csv"
-_SPARE_ROWS, _SPARE_SHARE = 3, 0.02  # by which rows and frames of a whole recording differ
+# By which rows and frames of a whole recording differ: at least, and of all.
+_SPARE_ROWS = (3, 0.02)
 _INNER = ("fx", "fy", "cx", "cy")
 
 
@@ -71,7 +74,7 @@ def read_stray(folder: Path) -> PosedSet:
                 time=find_number(row, "timestamp"),
                 depth=lidar_depth(depths.get(number), levels.get(number), lens)))
     table.rows.sort(key=lambda image: image.name)
-    if count and abs(count - len(rows)) > max(_SPARE_ROWS, _SPARE_SHARE * count):
+    if count and abs(count - len(rows)) > at_least(_SPARE_ROWS, count):
         table.notices.append(f"the video has {count} frames, but {_ODOMETRY} {len(rows)} rows: one "
                              "of them is cut short, or of another recording")
     return _check_up(table.finish_tracked(), folder / _IMU)
@@ -90,7 +93,7 @@ def _check_up(posed: PosedSet, imu: Path) -> PosedSet:
     if gravity is None or not gravity.is_sure:
         return posed
     off = float(np.degrees(np.arccos(np.clip(gravity.up @ np.array(Y_UP), -1, 1))))
-    if off <= UP_AGREES_DEG:  # ARKit's y is good to about one degree
+    if off <= MAX_UP_SPREAD_DEG:  # ARKit's y is good to about one degree
         return posed
     x, y, z = gravity.up
     return replace(posed, up=(float(x), float(y), float(z)), notices=(*posed.notices, (

@@ -12,7 +12,7 @@ _SAME, _NEAR = 1e-3, 5e-3
 # A gap longer than this many usual ones is where the camera was lost. What is far below the first
 # bound in seconds moves no camera; over more than the second a hand that turns round at 2 rad/s^2
 # leaves a straight motion by a degree.
-_USUAL_GAPS, _LEAST_GAP, _MOST_GAP = 2.5, 0.1, 0.25
+_USUAL_GAPS, _GAP = 2.5, (0.1, 0.25)
 
 
 class Trajectory:
@@ -32,7 +32,7 @@ class Trajectory:
         self._turns, self._centers = turns[order], centers[order]
         self._slerp = Slerp(self._times, self._turns) if len(self._times) > 1 else None
         usual = float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.0
-        self._gap = min(max(_USUAL_GAPS * usual, _LEAST_GAP), _MOST_GAP)
+        self._gap = min(max(_USUAL_GAPS * usual, _GAP[0]), _GAP[1])
 
     def viewmat(self, time: float) -> NDArray[np.float64] | None:
         """Returns [4, 4] world to camera at a time, None where no pose is near."""

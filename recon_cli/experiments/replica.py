@@ -11,7 +11,6 @@ from recon_cli.experiments.paper_tables import TABLE_I
 
 FRAMES = 200  # of the 2,000 of a room, evenly spread: the paper says nothing of its own
 SIZE = 1200  # pixels, the width of Replica's frames
-ITERATIONS = 30_000
 MAX_GAUSSIANS = 400_000  # the same limit for all methods
 
 _LAYOUT = ("Each room is a folder such as room0 with results/frame000000.jpg, "

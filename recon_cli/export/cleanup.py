@@ -32,22 +32,19 @@ from torch import Tensor
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, name_command
 from recon_cli.render import RenderOutput, render
-from recon_cli.render.contract import ALPHA_MIN
+from recon_cli.render.contract import ALPHA_MIN, SHOWN_WEIGHT
 from recon_cli.render.depth_loss import LEAST_COVERAGE
 from recon_cli.render.view_gradient import TensorCamera
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import EXTENT_SIGMAS, Splats
+from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.values import measure_distances, measure_extent
 
-_TOUCH = 3.0  # standard deviations
 _NEIGHBOURS = 16  # compared with each; a surface around a Gaussian has about six
-_SMALL = 0.005  # of the Gaussians at most
 _APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
-_EDGE = 0.005  # of the scene lies beyond each side of its box
+_OUTSIDE = 0.005  # of the Gaussians: a group is small, or lies beyond a side of the scene's box
 # Measurements behind these constants: tests/bench/notes/scenes.md.
-_WEIGHT = 0.01  # alpha T; below, a view does not show it. RadSplat's threshold for high quality
-_FEW = 2  # views
 _IN_FRONT = 0.5  # of the depth of the surface behind
 _HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
 _FAINT = 0.1  # opacity; without views only such a large Gaussian counts as haze
@@ -202,7 +199,8 @@ def count_sightings(
     seen_by = torch.zeros(len(splats), dtype=torch.int64, device=splats.means.device)
     with torch.no_grad():
         for view in views:
-            seen_by += _render_scores(splats, view.camera, backend).statistics.blend_max >= _WEIGHT
+            statistics = _render_scores(splats, view.camera, backend).statistics
+            seen_by += statistics.blend_max >= SHOWN_WEIGHT
             on_view()
     return seen_by
 
@@ -220,7 +218,7 @@ def _find_in_front(
     on_view: Callable[[], None],
 ) -> Tensor:
     """Returns which Gaussians are in front of the few views that see them, [N] bool."""
-    few = (seen_by > 0) & (seen_by <= _FEW)
+    few = (seen_by > 0) & (seen_by < MIN_OBSERVATIONS)
     in_front = few.clone()
     rest = splats.select(~few)
     if not few.any() or not len(rest):
@@ -228,7 +226,7 @@ def _find_in_front(
     with torch.no_grad():
         for view in views:
             statistics = _render_scores(splats, view.camera, backend).statistics
-            visible = few & (statistics.blend_max >= _WEIGHT)
+            visible = few & (statistics.blend_max >= SHOWN_WEIGHT)
             if visible.any():
                 behind = _render_scores(rest, view.camera, backend)
                 in_front[visible] &= _is_before(splats.means[visible], view.camera, behind)
@@ -262,11 +260,11 @@ def find_islands(splats: Splats, near: Tensor, visible: Tensor | None) -> Tensor
     counts = np.bincount(group)
     main = int(counts.argmax())
     far = _find_far_groups(means, group, main)
-    small = counts <= max(1, int(_SMALL * len(rows)))
+    small = counts <= max(1, int(_OUTSIDE * len(rows)))
     small[main] = False
     removed = small[group] & far[group]
     if visible is not None:
-        low, high = np.quantile(means[group == main], (_EDGE, 1 - _EDGE), axis=0)
+        low, high = np.quantile(means[group == main], (_OUTSIDE, 1 - _OUTSIDE), axis=0)
         outside = ((means < low) | (means > high)).any(axis=1)
         window = outside & visible.cpu().numpy()[rows.numpy()]
         removed &= ~np.isin(group, np.unique(group[window]))
@@ -285,7 +283,7 @@ def _find_groups(means: NDArray[np.float64], splats: Splats) -> NDArray[np.int64
     for rank in range(1, _NEIGHBOURS + 1):  # one at a time: all at once would take gigabytes
         neighbour, apart = other[:, rank], distance[:, rank]
         way = (means[neighbour] - means) / np.maximum(apart, 1e-12)[:, None]
-        touch = np.flatnonzero(apart <= _TOUCH * (
+        touch = np.flatnonzero(apart <= EXTENT_SIGMAS * (
             _deviations_along(scales, rotation, way)
             + _deviations_along(scales[neighbour], rotation[neighbour], way)))
         sources.append(touch)

@@ -32,12 +32,11 @@ from recon_cli.room.scale_fusion import (
 )
 from recon_cli.scene.gravity import camera_up, find_gravity, turn_onto
 from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.statistics import ROUNDING
 from recon_cli.splats.axes import UP
 from recon_cli.workspace.export_formats import PLAN
 from recon_cli.workspace.records import ImportRecord, find_frames, has_views
 from recon_cli.workspace.summaries import WorldSummary
-
-_RIGID = 1e-6  # difference of a scale from 1
 
 logger = logging.getLogger("recon")
 
@@ -88,7 +87,7 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
             f"{PLAN} cannot be measured: the scale is arbitrary.",
             hint="Give one known length with --scale-between A B METRES.")
     scale = frame.similarity.scale / ((frame.fused and frame.fused.scale) or 1.0)
-    if abs(scale - 1) > _RIGID:
+    if abs(scale - 1) > ROUNDING:
         raise StageError(
             f"{PLAN} cannot be measured: --transform changes the scale, so units are no longer "
             "metres.",

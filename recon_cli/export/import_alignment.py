@@ -27,7 +27,7 @@ SOURCE, WORKSPACE = "source", "workspace"
 _VIEWS = 6  # rendered in each frame, at most
 # dB above flat pictures: three scenes got 15 to 24 in place, 2.5 to 9 if turned by 3 degrees or a
 # tenth too large, and less than 2 if further off. tests/bench/bench_import_frames.py
-_DOUBTFUL, _EVIDENT = 8.0, 2.0
+_EVIDENCE_DB = (2.0, 8.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +44,10 @@ class Alignment:
     def doubt(self) -> str:
         """Why the frame may be wrong, as a sentence; empty if it fits."""
         above = self.psnr_db[self.frame] - self.flat_db
-        if not above >= _EVIDENT:  # a NaN too
+        if not above >= _EVIDENCE_DB[0]:  # a NaN too
             return (f"the imported scene does not match the views: {self}. It is in "
                     "another frame than the cameras, and its scores mean nothing")
-        if above < _DOUBTFUL:
+        if above < _EVIDENCE_DB[1]:
             return (f"the imported scene hardly matches the views: {self}. It is a poor "
                     "one, or its frame differs a little from that of the cameras")
         return ""

@@ -24,6 +24,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.camera_paths import tour_path, tour_seconds
 from recon_cli.scene.faces import pixel_rays
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.statistics import LEAST_WITNESSES
 from recon_cli.splats.format import Guide, Tour
 
 _EVERY = 0.5  # seconds from one place of a tour to the next
@@ -31,7 +32,6 @@ _DRAFT = 120  # places along which its length is measured
 _WITNESSES = 64  # cameras, at most, that are asked what they saw
 _SIDE = 64  # pixels of the longest side of a picture that is compared
 _MOST_MARGIN = 2.0  # times the picture's sides
-_VIEWS = 2  # that must have seen a point
 _SHARE = 0.75  # of the points in a border that must have been seen
 _BLUR = 1.5  # pixels, over which that share is taken
 _SAME = 0.1  # relative difference of depths of one surface
@@ -75,7 +75,8 @@ def plan_tour(splats: Splats, cameras: Sequence[Camera], ctx: StageContext) -> T
         wide = _widened(_small(place), _MOST_MARGIN)
         depth = _surface(splats, wide, ctx)
         points = _points(wide, depth)
-        seen = _count_views(points, [_small(camera) for camera in witnesses], depths) >= _VIEWS
+        count = _count_views(points, [_small(camera) for camera in witnesses], depths)
+        seen = count >= LEAST_WITNESSES
         margins.append(_find_margins(seen))
         shown.append(_count_cells(points[_inner(seen) & seen & (depth > 0)], _CELL * distance))
     steady = gaussian_filter1d(

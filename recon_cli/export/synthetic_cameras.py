@@ -16,13 +16,13 @@ from recon_cli.evaluation.reference_views import render_view
 from recon_cli.render.contract import NEAR
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.scene import Scene, View
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import EXTENT_SIGMAS, Splats
+from recon_cli.scene.statistics import FINE_SAMPLE
 from recon_cli.splats.ply import MIN_OPACITY
 from recon_cli.splats.values import measure_extent
 
 VIEW_SIZE = 600  # pixels, longest side of the renders that a file is checked on
 CAMERAS_AROUND = 4  # cameras outside, and as many inside
-_WIDTHS = 3.0  # standard deviations that a radius has at least: centres alone may all be one
 _LEAST_RADIUS = NEAR  # else Gaussians in the middle are too near to be drawn
 _DISTANCE = 2.5  # radii: the bulk and some space around it fill a field of view of 60 degrees
 _HEIGHT = 0.6  # radii, of the cameras outside
@@ -31,7 +31,6 @@ _CANDIDATES = 1000
 VISIBLE = 0.5 / 255  # coverage that changes an 8-bit image
 _FOV_DEG = 60.0
 _ASPECT = 1.5
-_POINTS = 20_000
 # PSNR that a good scene reaches on photos. Against its own renders a scene is perfect, and any
 # rounding would cost tens of dB that nobody sees.
 ASSUMED_DB = 30.0
@@ -50,8 +49,8 @@ def synthetic_scene(
     used = opaque if bool(opaque.any()) else ~opaque
     means = splats.means[used].double().cpu().numpy()
     middle, bulk = measure_extent(means)
-    radius = max(
-        bulk, _WIDTHS * float(splats.scales[used].amax(dim=1).double().median()), _LEAST_RADIUS)
+    size = float(splats.scales[used].amax(dim=1).double().median())  # centres alone may all be one
+    radius = max(bulk, EXTENT_SIGMAS * size, _LEAST_RADIUS)
     x_axis = np.array([1.0, 0, 0])
     y_axis = np.cross(up, x_axis)
     angles = np.pi * (0.25 + np.arange(CAMERAS_AROUND) / 2)
@@ -67,7 +66,7 @@ def synthetic_scene(
         View(f"made-up-{at}", Camera(
             width, height, focal, focal, width / 2, height / 2, viewmat), Path(), Path())
         for at, viewmat in enumerate(viewmats))
-    points = means[:: max(1, len(means) // _POINTS)]
+    points = means[:: max(1, len(means) // FINE_SAMPLE)]
     return Scene(views, (), (), (), points, np.zeros((len(points), 3), np.uint8))
 
 

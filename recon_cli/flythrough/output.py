@@ -26,6 +26,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 from PIL import Image
 
+from recon_cli.capture.video_colour import BT709
 from recon_cli.errors import ConfigError
 from recon_cli.flythrough.request import ALPHA, DEPTH, RGB, TRUST
 from recon_cli.io.images import read_image, to_uint8, write_png
@@ -50,7 +51,6 @@ _BLUE = 0.08  # of the colour map; colours before that are nearly black
 ENCODERS = {"h264": ("libx264",), "av1": ("libsvtav1", "libaom-av1")}  # the first available
 _QUALITY = 95  # of a .jpg or .webp
 _GIF_MS = 20  # of a frame, at least: browsers show shorter ones for 100 ms
-_BT709 = 1  # in FFmpeg's lists of primaries, transfer functions and matrices alike
 os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 prints its settings to stderr; 1 leaves errors
 
 
@@ -215,7 +215,8 @@ def _configure(context: VideoCodecContext, encoding: VideoEncoding) -> None:
     context.pix_fmt = "yuv420p"
     context.framerate = encoding.rate
     context.options = {"crf": str(encoding.crf)}
-    context.color_primaries = context.color_trc = context.colorspace = _BT709
+    # one number in FFmpeg's lists of primaries, transfer functions and matrices
+    context.color_primaries = context.color_trc = context.colorspace = int(BT709)
     context.color_range = ColorRange.MPEG
 
 

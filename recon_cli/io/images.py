@@ -20,6 +20,7 @@ from recon_cli.workspace.atomic import read_bytes, write_bytes
 from recon_cli.workspace.records import AGAIN
 
 _PNG = b"\x89PNG\r\n\x1a\n"  # what every PNG begins with
+HALF = 128  # of a mask of 8 bits: from this value on a pixel counts, is white, or opaque
 _SMALLEST = 16  # pixels a side; a smaller image tells nothing, and SSIM's window is 11
 
 

@@ -31,17 +31,17 @@ from recon_cli.io.depth_maps import (
 from recon_cli.scene.camera import Camera, Lens
 from recon_cli.scene.covisibility import observe_points
 from recon_cli.scene.scene import Scene, View
+from recon_cli.scene.statistics import COARSE_SAMPLE, OUTLIER_SIGMAS, robust_sigma
 from recon_cli.scene.train_view import SensorDepth
 
 MOST_SAMPLES = 16_000  # of a map, for training: one for 4 to 13 pixels of an image
 SAMPLE_BYTES = 3 * np.dtype(np.float32).itemsize  # ray and depth
 ALL_SAMPLES = 400_000  # for meshes: every pixel of the sensors of phones and cheap cameras
 FEWEST_POINTS = 200  # of all views
-MOST_POINTS = 4000  # looked at where no tracks say what views see
 LEAST_NOISE = 0.002  # relative; what depth of 16 bits and the nearest pixel leave
-# A view whose depths are off in the median by this share, or this many times the noise, shows
-# something else than its image, as with timestamps that do not match.
-MOST_OFF, MOST_TIMES_OFF = 0.05, 3.0
+# A view whose depths are off in the median by this share, or beyond the noise, shows something else
+# than its image, as with timestamps that do not match.
+MOST_OFF = 0.05
 _AROUND = np.ones((3, 3), np.uint8)
 
 
@@ -90,7 +90,7 @@ def _visible_points(scene: Scene, views: Sequence[View]) -> dict[str, NDArray[np
     if any(map(len, tracks.values())):
         nothing = np.empty(0, np.int64)
         return {view.name: tracks.get(view.name, nothing) for view in views}
-    some = np.arange(0, len(scene.points), max(1, len(scene.points) // MOST_POINTS))
+    some = np.arange(0, len(scene.points), max(1, len(scene.points) // COARSE_SAMPLE))
     shown = observe_points(scene.points[some], [view.camera for view in views]).matrix.toarray() > 0
     return {view.name: some[row] for view, row in zip(views, shown, strict=True)}
 
@@ -135,11 +135,11 @@ def _fit(
     medians = {name: float(np.median(values)) for name, values in ratios.items()
                if len(values) >= LEAST_POINTS}
     scale = float(np.median([*medians.values()] or [np.median(every)]))
-    noise = 1.4826 * float(np.median(np.abs(every / scale - 1)))
+    noise = robust_sigma(every / scale - 1)
     if noise > MOST_NOISE:
         return SensorViews(refused=f"it differs from the points of the model by {noise:.0%}")
     noise = max(noise, LEAST_NOISE)
-    off = max(MOST_OFF, MOST_TIMES_OFF * noise)
+    off = max(MOST_OFF, OUTLIER_SIGMAS * noise)
     left_out = tuple(name for name, value in medians.items() if abs(value / scale - 1) > off)
     return SensorViews({
         name: replace(one, depths=(one.depths / scale).astype(np.float32), noise=noise)

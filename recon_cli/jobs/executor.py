@@ -26,8 +26,9 @@ PROGRAM = "recon_cli"  # the module that is run
 CORES = 4  # of a command where nothing is said; more shorten it by little
 TRIES = 3  # of a command whose process is killed, by the system for want of memory or by somebody
 _ENDED = (ExitCode.HANGUP, ExitCode.TERMINATED)  # by a signal that recon handles
-_LOCK_SECONDS = 60.0  # within which a process that lost its parent is gone
-_STOP_SECONDS = 60.0  # for saving a checkpoint
+# Within which a process that lost its parent is gone, one that is stopped has saved its checkpoint,
+# and a busy machine answers.
+PATIENCE_SECONDS = 60.0
 
 
 class _NeedsGpu(dict[str, bool | None]):
@@ -124,7 +125,7 @@ class RunningCommand:
         process = self._process
         if process is not None:
             ask_to_end(process)
-            timer = threading.Timer(_STOP_SECONDS, process.kill)
+            timer = threading.Timer(PATIENCE_SECONDS, process.kill)
             timer.daemon = True
             timer.start()
 
@@ -183,5 +184,5 @@ def _wait_until_free(workspace: Path) -> None:
     """
     lock = FileLock(workspace / LOCK)
     with suppress(Timeout):
-        lock.acquire(timeout=_LOCK_SECONDS)
+        lock.acquire(timeout=PATIENCE_SECONDS)
         lock.release()

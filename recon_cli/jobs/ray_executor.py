@@ -24,12 +24,11 @@ except ImportError:  # `connect` says so
 
 from recon_cli import __version__
 from recon_cli.errors import BackendError, ExitCode, ReconError, WorkspaceError, list_names
-from recon_cli.jobs.executor import CORES, TRIES, Command, RunningCommand
+from recon_cli.jobs.executor import CORES, PATIENCE_SECONDS, TRIES, Command, RunningCommand
 from recon_cli.machine import install_command
 from recon_cli.signals import keeping_handlers
 from recon_cli.workspace.atomic import write_bytes
 
-_PROBE_SECONDS = 60.0  # for a machine that is busy
 _STORE_BYTES = 100 << 20  # of objects that travel; ours are words
 _HEAD_SECONDS = 2.0  # between two looks at the head
 _HEAD_TRIES = 5  # looks in a row that find no head, before it is given up
@@ -213,7 +212,7 @@ def _check_node(address: str, answer: Any, folder: Path) -> None:
     install = (f"Install recon {__version__} with its extra `ray` there, from the clone or wheel "
                "that this machine has, in the environment in which `ray start` was typed.")
     try:
-        found = ray.get(answer, timeout=_PROBE_SECONDS)
+        found = ray.get(answer, timeout=PATIENCE_SECONDS)
     except ray.exceptions.RayError as error:
         if "recon_cli" in str(error):  # a module that the machine could not import
             raise BackendError(

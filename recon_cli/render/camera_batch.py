@@ -25,10 +25,9 @@ from recon_cli.render.registry import renderer
 from recon_cli.render.torch.projection import project_rows
 from recon_cli.render.view_gradient import TensorCamera, view_gradient
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.scene.splats import LEAST_OPACITY, SH_C0, Splats
 
 _SCALE_MIN = 1e-37  # world units; kernels take no smaller one, and no float32 image shows it
-_OPACITY_MIN = 1e-6  # far below 1/255, from which on a Gaussian is drawn
 _COMPENSATION_MIN = 1e-20  # of its square: a Gaussian so thin is not drawn
 _EXTENT = 3.33  # standard deviations; gsplat's ellipse where 2 ln(255 o) is larger
 
@@ -466,7 +465,7 @@ class _Logit(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, opacities: Tensor) -> Tensor:
         high = 1 - torch.finfo(opacities.dtype).eps / 2  # the greatest number below 1
-        held = opacities.clamp(_OPACITY_MIN, high)
+        held = opacities.clamp(LEAST_OPACITY, high)
         ctx.save_for_backward(held.nan_to_num(0.5))  # a NaN is not drawn, and gets a zero
         return held.log() - (-held).log1p()
 

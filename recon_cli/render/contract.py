@@ -26,6 +26,7 @@ ALPHA_MAX = 0.99  # keeps 1 / (1 - alpha) bounded in the backward pass
 # A pixel stops before it would fall below this: 1e-4 less a margin for rounding, so that two
 # fragments of alpha .99, which leave 1e-4, are both drawn whatever the precision.
 TRANSMITTANCE_MIN = 0.9999e-4
+SHOWN_WEIGHT = 0.01  # alpha T of some pixel, from which on a view shows a Gaussian (RadSplat)
 CULL_SLACK = 1e-3  # in q: culling keeps what rounding leaves in doubt
 DILATION = 0.3  # pixels^2 added to the projected covariance: the low-pass filter of EWA splatting
 NEAR = 0.05  # world units; COLMAP's scenes measure about ten units across

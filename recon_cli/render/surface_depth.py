@@ -16,11 +16,8 @@ from recon_cli.render.contract import DILATION
 from recon_cli.render.registry import find_crossing
 from recon_cli.render.torch.projection import rotation_matrices
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splats import EXTENT_SIGMAS, Splats
 
-# Standard deviations of the longest axis by which a depth may differ from that of the centre: a ray
-# that only grazes a Gaussian is densest far from it.
-_MOST_SIGMAS = 3.0
 # The median of what lies along a ray. Trained on a backdrop, surfaces let a seventh of it through
 # instead of a twentieth. Chosen on the room "living" alone, bench_mesh.py.
 _LEVEL, _LEVEL_ON_BACKDROP = 0.5, 0.6
@@ -70,7 +67,7 @@ def surface_of(
     thinnest = axes.gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1))[..., 0]
     table = torch.cat([
         A[:, 0], A[:, 1, 1:], A[:, 2, 2:], pull, thinnest, means[:, 2:],
-        _MOST_SIGMAS * scales.amax(1, keepdim=True)], dim=1)
+        EXTENT_SIGMAS * scales.amax(1, keepdim=True)], dim=1)
     flat = rows.reshape(-1)
     (a, b, c, d, e, f, px, py, pz, nx, ny, nz, z, reach) = table[flat.clamp_min(0)].T
     shape = camera.height, camera.width

@@ -18,6 +18,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
+from recon_cli.evaluation.metrics import ERROR_GAIN
 from recon_cli.evaluation.scores import Metrics, ViewScore
 from recon_cli.io.images import encode_image, fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
@@ -77,7 +78,7 @@ class Gallery:
     left_out: int = 0  # views for which there was no room
     damaged: tuple[str, ...] = ()  # why views are missing, a sentence each
     # of differences, as in evaluate/difference
-    gain: ClassVar[int] = 4
+    gain: ClassVar[int] = ERROR_GAIN
     most_error: ClassVar[int] = 256 // gain  # in 1/255; beyond, colours no longer change
 
     @property
@@ -247,7 +248,7 @@ def draw_difference(
     size = fit_size(error.shape[1], error.shape[0], longest)
     if size != error.shape[::-1]:
         error = cv2.resize(error, size, interpolation=cv2.INTER_AREA)
-    colors = apply_colormap(np.rint(error * Gallery.gain).clip(0, 255).astype(np.uint8))
+    colors = apply_colormap(np.rint(error * ERROR_GAIN).clip(0, 255).astype(np.uint8))
     if hidden is not None and hidden.any():
         small = cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         colors[small > 0.5] = _HIDDEN

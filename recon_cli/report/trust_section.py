@@ -14,10 +14,11 @@ from recon_cli.report.chart import Axis, Series, draw_chart
 from recon_cli.report.gallery import MOST_THUMBS, note_damage, read_picture
 from recon_cli.report.records import MODELS
 from recon_cli.report.stage_status import StageReports
+from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.trust.heat_map import INVENTED, TRUSTED, legend_stops
 from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.scene_trust import FOLDER, ModelTrust, TrustRecord
-from recon_cli.trust.surface import MIN_SPAN_DEG, MIN_VIEWS
+from recon_cli.trust.surface import MIN_SPAN_DEG
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def read_trust(stages: StageReports) -> TrustSection:
     first = next(iter(models.values()))
     return TrustSection(
         "", f"{first.surface.well:.0%} of the surface that the views show is well seen: by "
-        f"{MIN_VIEWS} views or more that span {MIN_SPAN_DEG:g} degrees or more.",
+        f"{MIN_OBSERVATIONS} views or more that span {MIN_SPAN_DEG:g} degrees or more.",
         _surface_table(models), _agreement_table(models), _draw_reliability(models),
         _read_pictures(stages["evaluate"].folder, next(iter(models))),
         tuple(each.describe(record.unit) for each in record.poorly_seen),
@@ -79,7 +80,7 @@ def read_trust(stages: StageReports) -> TrustSection:
 
 def _surface_table(models: dict[str, ModelTrust]) -> Table:
     return Table(
-        ("model", "well seen", "from one direction only", f"by fewer than {MIN_VIEWS} views",
+        ("model", "well seen", "from one direction only", f"by fewer than {MIN_OBSERVATIONS} views",
          "training views"),
         tuple((MODEL_LABELS[name], f"{trust.surface.well:.1%}", f"{trust.surface.narrow:.1%}",
                f"{trust.surface.few:.1%}", f"{trust.views:,}") for name, trust in models.items()))

@@ -15,15 +15,15 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from recon_cli.kernels.thread_pool import pool
+from recon_cli.room.kernels import LEAST_COSINE
 from recon_cli.room.texture_kernels import draw
 
 _PADDING = 2  # texels between charts
 _SMOOTHED = 6  # rings of triangles that the direction of one is a mean over
 _STEPS = 8  # of k-means over the directions
-_LEAST_COSINE = 0.3  # between a triangle and the direction that it is seen along
+GRAZING = 0.3  # cosine between the normal of a surface and the direction that it is seen along
 _TINY = 40  # triangles; smaller pieces join their neighbours, if they face the same way at all
 _MERGED = 4  # times that this is tried
-_FACING = 0.1  # cosine, for that
 _LAYERS = 4  # that lie over each other in one piece, at most
 _CELLS = 2.0  # cells along the edge of a mean triangle, for finding them
 _APART = 1.5  # mean edges, from which on a triangle lies under another one
@@ -95,13 +95,13 @@ def _label(
         directions = np.where((sums != 0).any(axis=1, keepdims=True), _unit(sums), directions)
     labels = (smooth @ directions.T).argmax(axis=1)
     cosines = unit @ directions.T
-    away = cosines[np.arange(len(labels)), labels] < _LEAST_COSINE
+    away = cosines[np.arange(len(labels)), labels] < GRAZING
     labels[away] = cosines[away].argmax(axis=1)
     for _ in range(_MERGED):
         pieces = _connect(labels, links)
         tiny = np.bincount(pieces)[pieces] < _TINY
         votes = np.stack([graph @ (labels == row) for row in range(len(directions))], axis=1)
-        votes[cosines < _FACING] = 0
+        votes[cosines < LEAST_COSINE] = 0
         best = votes.argmax(axis=1)
         moved = tiny & (votes[np.arange(len(best)), best] > 0)
         labels[moved] = best[moved]

@@ -14,11 +14,10 @@ from recon_cli.room.kernels import LEAST_COSINE
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import TOLERANCE, camera_row
+from recon_cli.stereo.depths import NEAREST, TOLERANCE, camera_row
 from recon_cli.stereo.kernels import compare
 
 # Chosen on the room "living" and checked on "office", tests/bench/bench_mesh.py:
-NEAR = 0.02  # of the median depth; nothing nearer to a camera is a surface
 _NEIGHBOURS = 12  # views that each is compared with
 _TURN = 2.0  # median depths that a difference of 1 in the cosine of two directions counts as
 _LEAST_TURN = 0.5  # cosine between the directions of neighbours
@@ -37,7 +36,7 @@ class DepthMaps:
     @property
     def near(self) -> float:
         """Least depth of a surface, world units."""
-        return NEAR * self.median
+        return NEAREST * self.median
 
 
 def render_depth_maps(
@@ -69,7 +68,7 @@ def weigh(
     """Returns depth maps whose weights are cosines [H, W] over squared depths, 0 where too near."""
     some = np.concatenate([depth[::4, ::4][depth[::4, ::4] > 0] for depth in depths])
     median = float(np.median(some)) if len(some) else 0.0
-    least = NEAR * median
+    least = NEAREST * median
     gains = [np.where(depth > least, cosine / np.maximum(depth / max(median, 1e-30), 0.1) ** 2, 0)
              .astype(np.float32) for depth, cosine in zip(depths, cosines, strict=True)]
     return DepthMaps(views, cameras, depths, gains, median)

@@ -13,8 +13,8 @@ from recon_cli.io.meshes import Mesh, read_mesh, write_mesh
 from recon_cli.room.measures import RoomFrame, measure_room
 from recon_cli.room.mesh import MeshResult
 from recon_cli.room.plan_svg import describe, draw_plan
+from recon_cli.scene.statistics import ROUNDING
 from recon_cli.splats.glb import nearest_axes
-from recon_cli.splats.ply import ROUNDING
 from recon_cli.workspace.atomic import write_bytes, write_json
 
 MEASURES = "measures.json"

@@ -20,13 +20,13 @@ from recon_cli.io.mesh_data import Mesh
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.room.charts import plane_axes
 from recon_cli.room.depth_maps import DepthMaps
-from recon_cli.room.mesh_planes import face_geometry
+from recon_cli.room.mesh_planes import BAND, face_geometry
 from recon_cli.room.planes import LEAST_COSINE, Plane, find_planes
 from recon_cli.room.texture import draw_mesh
 from recon_cli.room.texture_kernels import draw
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.statistics import MOST_MAPS
 
-_BAND = 2.0  # voxels, within which surface belongs to a plane
 _NEAR = 6.0  # voxels, within which a bump is not a hole
 _ACROSS = 0.2  # cosine between planes that meet, at most
 _CLOSED = 2  # cells of a gap in what surrounds a hole
@@ -36,7 +36,6 @@ _AROUND = 80  # cells, within which what surrounds a hole lies in each of eight 
 _MARGIN = 40  # cells around the surface of a plane, to the lines in which it meets others
 _AGREE = 0.05  # of a depth, within which a view shows the plane, not what lies behind it
 _MOST_CROSSED = 0.1  # share of them and of those whose rays cross it, that may cross it
-_MOST_VIEWS = 100  # that are asked about a hole
 _LEAST_CELLS = 12  # of a hole
 _MOST_CELLS = 4_000_000  # of the grid of a plane
 
@@ -84,7 +83,7 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
         voxel: side of its voxels, world units.
     """
     centers, normals, areas = face_geometry(mesh.vertices, mesh.faces)
-    planes = find_planes(centers, normals, areas, _BAND * voxel)
+    planes = find_planes(centers, normals, areas, BAND * voxel)
     views = _draw_depths(maps, mesh)
     vertices, faces, count = [], [], 0
     patches = [(plane, mesh.vertices[_own_faces(plane, mesh, voxel)]) for plane in planes]
@@ -103,9 +102,9 @@ def infer_surface(mesh: Mesh, maps: DepthMaps, voxel: float) -> Mesh | None:
 
 
 def _draw_depths(maps: DepthMaps, mesh: Mesh) -> list[_DepthView]:
-    """Returns up to `_MOST_VIEWS` of the maps, evenly spread, and the mesh in them."""
+    """Returns up to `MOST_MAPS` of the maps, evenly spread, and the mesh in them."""
     rows = np.unique(np.linspace(
-        0, len(maps.cameras) - 1, min(len(maps.cameras), _MOST_VIEWS)).round().astype(int))
+        0, len(maps.cameras) - 1, min(len(maps.cameras), MOST_MAPS)).round().astype(int))
     return [_DepthView(maps.cameras[row], maps.depths[row], draw_mesh(
         maps.cameras[row], mesh.vertices, mesh.faces).nearness) for row in rows]
 
@@ -144,7 +143,7 @@ def _own_faces(plane: Plane, mesh: Mesh, voxel: float) -> NDArray[np.int64]:
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
-    near = np.abs(corners @ plane.normal - plane.offset).max(axis=1) < _BAND * voxel
+    near = np.abs(corners @ plane.normal - plane.offset).max(axis=1) < BAND * voxel
     return np.asarray(mesh.faces[near & (normals @ plane.normal > LEAST_COSINE * lengths)])
 
 

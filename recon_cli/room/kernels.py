@@ -14,10 +14,9 @@ from recon_cli.kernels.thread_pool import AT_ONCE
 
 SIDE = 8  # voxels along the side of a block
 CELLS = SIDE**3
-_HALF_DIAGONAL = 0.8660254  # of a cube
 LEAST_COSINE = 0.1  # between ray and normal, for a view to count as one of this side
 # columns of the counts of `observe`
-SHOWN, SEEN_THROUGH = 0, 1
+SHOWN, SEEN_THROUGH = range(2)
 
 
 @kernel
@@ -36,7 +35,7 @@ def integrate(counter, blocks, values, weights, depth, gain, view, voxel, band, 
     Behind half of the band weights fall to zero at its end: there begins another surface.
     """
     R, t = view.R, view.t
-    reach = voxel * SIDE * _HALF_DIAGONAL + band
+    reach = voxel * SIDE * math.sqrt(3) / 2 + band
     widest = 1.5 * max(view.fx, view.fy)
     while True:
         first = fetch_add(counter, 0, AT_ONCE)

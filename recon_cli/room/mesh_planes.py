@@ -9,14 +9,14 @@ from recon_cli.room.depth_maps import DepthMaps
 from recon_cli.room.planes import Plane, confirm_all, find_planes
 from recon_cli.room.volume import extract, fuse
 
-_COARSE = 2.0  # voxels; a side of those that planes are looked for in
+BAND = 2.0  # voxels, within which surface belongs to a plane, and a side of those it is fused in
 
 
 def surface_planes(
     maps: DepthMaps, voxel: float, farthest: float, points: NDArray[np.float64]
 ) -> list[tuple[Plane, Plane | None]]:
     """Returns the large planes of the surface, each also as triangulated points confirm it."""
-    band = _COARSE * voxel
+    band = BAND * voxel
     vertices, faces = extract(fuse(maps, band, farthest))
     centers, normals, areas = face_geometry(vertices, faces)
     planes = find_planes(centers, normals, areas, band)

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from recon_cli.io.svg import PlanLayout, element, join_points, label
 from recon_cli.room.measures import RoomMeasures
+from recon_cli.scene.statistics import FINE_SAMPLE
 
 _WIDTH, _MARGIN, _LINE = 800, 60, 18  # pixels
 _SQUARE = "m\u00b2"
-_MOST_SEGMENTS = 20_000
 _REACH = 99.5  # percentile of the cut that the plan shows, where there is no footprint
 
 
 def draw_plan(measures: RoomMeasures) -> str:
     """Returns the plan; without walls the cut alone, and the missing measures below it."""
     cut, footprint = measures.cut, measures.footprint
-    cut = cut[:: max(1, -(-len(cut) // _MOST_SEGMENTS))]
+    cut = cut[:: max(1, -(-len(cut) // FINE_SAMPLE))]
     low, high = _bounds(cut, footprint)
     scale = (_WIDTH - 2 * _MARGIN) / float(max(high - low))
     width, bottom = map(float, (high - low) * scale + 2 * _MARGIN)

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.scene.statistics import OUTLIER_SIGMAS, robust_sigma
+
 _TRIALS = 400  # candidates for each plane, each through one point along its normal
 _SAMPLE = 12_000  # points that candidates are scored on
 LEAST_COSINE = 0.8  # between a plane and the normals of its points: reconstructed walls are bumpy
@@ -80,11 +82,7 @@ def _fit(
         fitted = np.linalg.eigh(offsets.T @ offsets)[1][:, 0]
         normal = fitted if fitted @ normal > 0 else -fitted
         offset = float(middle @ normal)
-    off = np.abs(points[rows] @ normal - offset)
-    order = np.argsort(off)
-    cumulated = np.cumsum(areas[rows][order])
-    # 1.4826: from the median of absolute values to a standard deviation, for a normal distribution
-    spread = 1.4826 * float(off[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
+    spread = robust_sigma(points[rows] @ normal - offset, areas[rows])
     return Plane(normal, offset, float(areas[rows].sum()), spread, rows)
 
 
@@ -92,7 +90,6 @@ def _fit(
 _LEAST_POINTS = 60
 _LEAST_PEAK = 0.25  # share of the points near a plane that lie in its densest layer
 _SURE_PEAK = 0.5  # share from which on they may lie as far off as they are looked for
-_MOST_SHIFT = 3.0  # spreads
 _LEAST_PARALLEL = 0.99  # cosine of the turn
 _CELL = 6.0  # bands, side of the cells in which points count as over the plane
 _LAYER = 0.4  # of a band, thickness of a wall as points show it
@@ -167,8 +164,8 @@ def confirm(
     middle = np.average(surface[plane.rows], axis=0)
     shift = abs(float(middle @ normal) - offset)
     sure = layers[peak] >= _SURE_PEAK * len(near)
-    if (shift > max(_MOST_SHIFT * plane.spread, layer) and not sure) or (
+    if (shift > max(OUTLIER_SIGMAS * plane.spread, layer) and not sure) or (
             normal @ plane.normal < _LEAST_PARALLEL):
         return None
-    spread = 1.4826 * float(np.median(np.abs(near[inside] @ normal - offset)))
+    spread = robust_sigma(near[inside] @ normal - offset)
     return Plane(normal, offset, plane.area, spread, plane.rows)

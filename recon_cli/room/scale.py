@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import ConfigError
 from recon_cli.scene.camera import Camera, Lens
+from recon_cli.scene.statistics import ROUNDING, at_least
 
 # where the scale comes from
 ARBITRARY, DATA_SET, MEASURED, FUSED = "arbitrary", "data set", "measured", "fused"
@@ -23,9 +24,7 @@ END_METRES = 0.003  # by which each end of a length is missed with a tape or a c
 # Largest distance of a sparse point from a pixel, as a share of the image's width. In two rendered
 # rooms picks within two pixels of a corner had a depth 0.5% and 0.7% off in the middle, 5% in the
 # worst tenth; of picks anywhere a third found a point within 3 pixels, a sixth another surface.
-_REACH = 0.005
-_LEAST_REACH = 4.0  # pixels
-_EQUAL = 1e-6  # share of the distance to the origin; nearer than this is the same point
+_REACH = (4, 0.005)  # pixels at least, and of the width
 _HINT = (
     "A and B are each a frame's name, x,y,z or FRAME:u,v, such as --scale-between "
     "000003.png:120,200 000003.png:480,210 1.5")
@@ -94,7 +93,7 @@ def measure(
         _locate(parse_place(text.strip(), viewmats.keys()), points, viewmats, pinholes)
         for text in (request.a, request.b))
     distance = float(np.linalg.norm(a - b))
-    if distance <= _EQUAL * max(float(np.abs([a, b]).max()), 1e-12):
+    if distance <= ROUNDING * max(float(np.abs([a, b]).max()), 1e-12):
         raise ConfigError(
             f"{request.a} and {request.b} are the same point, "
             f"{','.join(f'{value:.4g}' for value in a)}.", hint=_HINT)
@@ -166,7 +165,7 @@ def _depth_at(
     pixels, depths = camera.project(points)
     pixels, depths = pixels[depths > 0], depths[depths > 0]
     off = np.hypot(*(pixels - (u, v)).T)
-    reach = max(_LEAST_REACH, _REACH * camera.width)
+    reach = at_least(_REACH, camera.width)
     if not (off <= reach).any():
         hint = "Pick a corner or a textured spot."
         if len(off):

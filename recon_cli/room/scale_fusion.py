@@ -12,15 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from recon_cli.errors import list_names
+from recon_cli.scene.statistics import OUTLIER_SIGMAS
 from recon_cli.workspace.json_record import JsonRecord
 
 # sources
 MEASURED_BETWEEN, GIVEN = "--scale-between", "the data set"
-# Relative error of the unit of a data set in metres: assumed, as of phones 0.3 to 1% are reported.
+# Relative error of the unit of a data set in metres, and of the motions that a phone tracked, which
+# is the same in all of a capture: assumed, as of phones 0.3 to 1% are reported.
 GIVEN_ERROR = 0.003
 INTERVAL = 1.96  # standard errors, of an interval of 95% of a normal distribution
-# Sources contradict each other if they differ by more than this multiple of their common error.
-MOST_APART = 3.0
 # Where as many sources contradict as agree, the interval reaches to all, up to this share; what is
 # farther apart is a wrong unit, and no scale is taken.
 MOST_UNSURE = 0.2
@@ -108,7 +108,7 @@ def fuse_measured(scale: float, error: float, known: Sequence[ScaleSource]) -> F
 
 def _agree(one: ScaleSource, other: ScaleSource) -> bool:
     apart = abs(math.log(one.scale / other.scale))
-    return apart <= MOST_APART * math.hypot(one.error, other.error)
+    return apart <= OUTLIER_SIGMAS * math.hypot(one.error, other.error)
 
 
 def _names(sources: Sequence[ScaleSource]) -> str:

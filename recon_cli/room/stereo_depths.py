@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.io.depth_maps import LEAST_POINTS
 from recon_cli.io.images import reduce_view
 from recon_cli.progress import Progress
 from recon_cli.room.depth_maps import DepthMaps, weigh
@@ -21,6 +22,7 @@ from recon_cli.stereo.depths import (
     StereoView,
     find_depths,
     find_partners,
+    spanned,
     unproject,
 )
 
@@ -28,8 +30,6 @@ _SIDE = 600  # pixels of the longer side at most
 _MOST_VIEWS = 150  # that get a depth map, evenly spread; about 2 CPU seconds each
 _NEIGHBOURS = 20  # views that each is compared with; more of them find more of blank walls
 _SAMPLES = 3000  # points looked at to find them
-_LEAST_PIXELS = 20  # with depth, to tell how near and far is searched
-_TAIL = 0.01  # of the pixels, which do not count for that
 _RENDERED = 0.3  # weight of the Gaussians' depth, that of stereo being 1
 
 
@@ -80,12 +80,10 @@ def _photos(maps: DepthMaps) -> list[StereoView]:
     photos = []
     for view, depth in zip(maps.views, maps.depths, strict=True):
         some = depth[depth > 0]
-        if len(some) < _LEAST_PIXELS:
+        if len(some) < LEAST_POINTS:
             some = np.concatenate([other[::8, ::8][other[::8, ::8] > 0] for other in maps.depths])
-        near, far = np.quantile(some, [_TAIL, 1 - _TAIL])
         longest = max(view.camera.width, view.camera.height)
-        photos.append(
-            StereoView(reduce_view(view, max(1.0, longest / _SIDE)), float(near), float(far)))
+        photos.append(StereoView(reduce_view(view, max(1.0, longest / _SIDE)), *spanned(some)))
     return photos
 
 

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from recon_cli.io.mesh_data import Mesh, Texture
 from recon_cli.kernels.thread_pool import pool
 from recon_cli.progress import Progress
-from recon_cli.room.charts import Charts, make_charts
+from recon_cli.room.charts import GRAZING, Charts, make_charts
 from recon_cli.room.mesh_planes import vertex_normals
 from recon_cli.room.texture_kernels import COLUMNS, GAIN, WEIGHT, bake, draw, shade
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.statistics import LEAST_SHARED, REFIT_ROUNDS, UNCLIPPED
 from recon_cli.scene.train_view import TrainView
 from recon_cli.stereo.depths import EDGE, camera_row
 
@@ -33,10 +34,6 @@ MOST_PIXELS = 50_000_000  # of all photos; 11 bytes of each are in memory
 TOLERANCE = 0.025  # of a depth, within which a view shows a texel or vertex
 _FEATHER = 6  # pixels within which a view fades towards what hides a surface
 _SAMPLES = 6000  # vertices by which photos are compared
-_ROUNDS = 4  # of that comparison
-_DARK, _BRIGHT = 12.0, 243.0  # beyond, pixels may be clipped
-_LEAST_SHARED = 40  # samples of a view, below which its gains stay
-_LEAST_COSINE = 0.3  # between ray and normal of a sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +222,7 @@ def _measure(
     rows, column, row, depth = view.camera.find_visible(points)
     ray = points[rows] - view.camera.center
     cosine = -(ray * normals[rows]).sum(1) / np.linalg.norm(ray, axis=1)
-    seen = (cosine > _LEAST_COSINE) & (
+    seen = (cosine > GRAZING) & (
         np.abs(one.nearness[row, column] - 1 / depth) < TOLERANCE / depth)
     if view.mask is not None:
         seen &= view.mask[row, column]
@@ -233,7 +230,8 @@ def _measure(
     gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     fine = cv2.blur(np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 1.5)), (9, 9))
     colors = soft[row, column]
-    fair = seen & (colors > _DARK).all(1) & (colors < _BRIGHT).all(1)
+    dark, bright = UNCLIPPED
+    fair = seen & (colors > dark).all(1) & (colors < bright).all(1)
     values = np.concatenate([colors, fine[row, column][:, None] + 0.5], axis=1)
     logs = np.full((len(points), 4), np.nan)
     logs[rows[fair]] = np.log(np.maximum(values[fair], 1e-3))
@@ -246,10 +244,10 @@ def _offsets(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     several = known.sum(axis=0) > 1
     logs, known = logs[:, several], known[:, several]
     offsets = np.zeros((len(logs), logs.shape[2]))
-    used = known.sum(axis=1) >= _LEAST_SHARED
+    used = known.sum(axis=1) >= LEAST_SHARED
     if not used.any():
         return offsets
-    for _ in range(_ROUNDS):
+    for _ in range(REFIT_ROUNDS):
         shared = np.nanmedian(logs - offsets[:, None], axis=0)
         offsets[used] = np.nanmedian(logs[used] - shared, axis=1)
         offsets[used] -= offsets[used].mean(axis=0)

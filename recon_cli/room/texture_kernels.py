@@ -10,13 +10,16 @@ import math
 from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd_functions import fetch_add
 from recon_cli.kernels.thread_pool import AT_ONCE
+from recon_cli.stereo.depths import CAMERA_NUMBERS
 
 MOST_CANDIDATES = 4096  # views of a triangle; a float of each lies in the scratch of a thread
 _LEAST_COSINE = 0.05  # between ray and normal
 _LARGE = 6.0  # pixels; of smaller triangles a few places tell whether a view shows them
 # columns of a row of the table of views: as `stereo.depths.camera_row`, then the weight of the view
 # and its gains of red, green and blue
-WEIGHT, GAIN, COLUMNS = 18, 19, 22
+WEIGHT = CAMERA_NUMBERS
+GAIN = WEIGHT + 1
+COLUMNS = GAIN + 3
 
 
 @kernel

@@ -18,13 +18,13 @@ from recon_cli.kernels.viewpoint import viewpoint
 from recon_cli.room.depth_maps import DepthMaps
 from recon_cli.room.kernels import CELLS, SIDE, integrate
 from recon_cli.scene.faces import pixel_rays
+from recon_cli.scene.voxels import join_places, split_numbers
 
 BAND = 3.0  # truncation: voxels before and behind a surface
 BYTES = 8 * CELLS  # of a block
 _STRIDE = 3  # pixels between those that blocks are made for; they lie much closer than a block
 _CHUNK = 8  # blocks along the side of a chunk for marching cubes
 _PART = 2048  # parts of a voxel within which two chunks have the same vertex
-_OFFSET, _BITS = 1 << 20, 21  # of a coordinate of a block in its key
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,8 @@ def find_blocks(maps: DepthMaps, voxel: float, farthest: float) -> NDArray[np.in
         rays, depth = rays[used] @ camera.viewmat[:3, :3], depth[used]
         places = [np.floor((camera.center + rays * (depth + shift)[:, None]) / size).astype(
             np.int64) for shift in (-band, 0.0, band)]
-        keys = np.union1d(keys, np.concatenate([_keys(part) for part in places]))
-    return _places(keys)
+        keys = np.union1d(keys, np.concatenate([join_places(part) for part in places]))
+    return split_numbers(keys)
 
 
 def fuse(
@@ -72,12 +72,12 @@ def extract(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
     There is a surface only between voxels that views say something about: its rims stay open.
     """
-    keys = _keys(volume.blocks)
-    chunks = np.unique(_keys(np.floor_divide(volume.blocks, _CHUNK)))
+    keys = join_places(volume.blocks)
+    chunks = np.unique(join_places(np.floor_divide(volume.blocks, _CHUNK)))
     vertices: list[NDArray[np.int64]] = [np.empty((0, 3), np.int64)]
     faces: list[NDArray[np.int64]] = [np.empty((0, 3), np.int64)]
     count = 0
-    for corner in _places(chunks).astype(np.int64) * _CHUNK:
+    for corner in split_numbers(chunks).astype(np.int64) * _CHUNK:
         values, known = _gather(volume, keys, corner)
         # skimage looks for a cube's mask at its far corner
         cubes = np.zeros(values.shape, bool)
@@ -107,7 +107,7 @@ def _gather(
     """Returns values and which are known of a chunk with one more voxel on its far sides."""
     size = _CHUNK + 1
     grid = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    wanted = _keys(grid + corner)
+    wanted = join_places(grid + corner)
     rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     there = keys[rows] == wanted
     values = np.ones((len(grid), CELLS), np.float32)
@@ -124,14 +124,3 @@ def _all_corners(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     pairs = known[:-1] & known[1:]
     pairs = pairs[:, :-1] & pairs[:, 1:]
     return np.asarray(pairs[:, :, :-1] & pairs[:, :, 1:])
-
-
-def _keys(places: NDArray[np.integer]) -> NDArray[np.int64]:
-    x, y, z = (places.astype(np.int64) + _OFFSET).T
-    return np.asarray((x << 2 * _BITS) | (y << _BITS) | z)
-
-
-def _places(keys: NDArray[np.int64]) -> NDArray[np.int32]:
-    least = (1 << _BITS) - 1
-    parts = [keys >> 2 * _BITS, (keys >> _BITS) & least, keys & least]
-    return np.ascontiguousarray(np.stack(parts, axis=1) - _OFFSET, np.int32)

@@ -17,7 +17,7 @@ from recon_cli.scene.similarity import Similarity
 SPHERE_GAUSSIANS = 1024  # 6 degrees apart; more where they would be too large for a format
 SPHERE_OPACITY = 0.99  # the rasterizers clamp alpha there
 _MOST = 1 << 15
-_AT_ONCE = 256  # more of them: .compressed.ply has chunks of so many, of which they fill their own
+AT_ONCE = 256  # more of them: they fill chunks of their own in a .compressed.ply
 # of the distance of what is farthest: depth is along the axis of a camera, so that Gaussians aside,
 # which reach into the middle, would hide what is not much nearer
 _BEHIND = 2.0
@@ -85,7 +85,7 @@ class Backdrop:
         farthest = np.linalg.norm(finite - middle, axis=1).max(initial=self.reach)
         radius = float(_BEHIND * farthest) or 1.0
         enough = 4 * np.pi * (_SPREAD * radius / largest) ** 2
-        count = int(np.clip(_AT_ONCE * np.ceil(enough / _AT_ONCE), SPHERE_GAUSSIANS, _MOST))
+        count = int(np.clip(AT_ONCE * np.ceil(enough / AT_ONCE), SPHERE_GAUSSIANS, _MOST))
         scale = float(_SPREAD * radius * np.sqrt(4 * np.pi / count))
         return middle + radius * fibonacci_sphere(count), scale
 

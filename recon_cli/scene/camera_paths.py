@@ -16,8 +16,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.camera import Camera, looking_at
+from recon_cli.scene.statistics import FINE_SAMPLE
 
-_SAMPLES = 20_000  # points that are projected at most
 _MIDDLE = 0.5  # of the picture's sides: the part that shows a camera's target
 _LEAST_RADIUS = 0.05  # of the median distance from the middle: cameras may all be above it
 # Standard deviation of the filter before the spline: a fortieth of the path, up to three cameras.
@@ -30,7 +30,7 @@ _FASTER = 2.0  # times the mean turn rate of the view, above which the path slow
 _CALM = 2.0  # times the filter of a path
 _TURN = np.radians(15.0)  # a second, on average
 _WALK = 0.2  # of the distance to what is seen, a second, on average
-_SHORTEST, _LONGEST = 20.0, 180.0  # seconds
+_SECONDS = (20.0, 180.0)  # shortest and longest
 # Photos in no order: another order makes their path shorter than this share of the one by name.
 _SHORTER = 0.6
 
@@ -97,7 +97,7 @@ def tour_seconds(path: NDArray[np.float64], distance: float) -> float:
     angle = float((turns[:-1].inv() * turns[1:]).magnitude().sum())
     way = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
     seconds = max(angle / _TURN, way / (_WALK * max(distance, 1e-12)))
-    return float(np.clip(seconds, _SHORTEST, _LONGEST))
+    return float(np.clip(seconds, *_SECONDS))
 
 
 def order_cameras(viewmats: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -229,7 +229,7 @@ def visible_depths(
     camera: Camera, points: NDArray[np.float64], part: float = 1.0
 ) -> NDArray[np.float64]:
     """Returns the depths of the points within the middle `part` of a picture's sides."""
-    sample = points[:: max(1, len(points) // _SAMPLES)]
+    sample = points[:: max(1, len(points) // FINE_SAMPLE)]
     pixels, depths = camera.project(sample)
     off = np.abs(pixels - (camera.cx, camera.cy))
     return depths[(off < (part * camera.width / 2, part * camera.height / 2)).all(axis=1)]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import format_count
 from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.statistics import robust_sigma
 from recon_cli.scene.surfaces import Floor, Walls, find_floor, find_walls
 
 # Cameras that turn all around have no mean direction: below this length it is that of the noise.
@@ -79,6 +80,8 @@ def _flat(direction: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np
 
 
 MIN_CAMERAS = 3
+# Between up by single frames of a device and its mean, in the median, and up by two of its sensors.
+MAX_UP_SPREAD_DEG = 5.0
 # Frames whose rolls count as independent: a hand leans for many frames. The errors of two rendered
 # walks of 75 frames were those of 2.5 independent frames.
 _INDEPENDENT = 5
@@ -188,7 +191,6 @@ def _normal(axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, floa
         values, vectors = np.linalg.eigh((axes * weights[:, None]).T @ axes / weights.sum())
         weights = 1 / np.maximum(np.abs(axes @ vectors[:, 0]), _FLOOR_WEIGHT)
     spread = float(np.sqrt(max(values[1], 0.0)))
-    off = np.median(np.abs(np.arcsin(np.clip(axes @ vectors[:, 0], -1, 1))))
-    # 1.4826: from the median of absolute values to a standard deviation, for a normal distribution.
-    error = 1.4826 * off / max(spread * np.sqrt(_INDEPENDENT), 1e-12)
+    off = robust_sigma(np.arcsin(np.clip(axes @ vectors[:, 0], -1, 1)))
+    error = off / max(spread * np.sqrt(_INDEPENDENT), 1e-12)
     return vectors[:, 0], spread, float(min(error, np.pi / 2))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-_SEGMENT = 256 << 20  # bytes that are mapped at once: each mapping takes a file descriptor
+SEGMENT = 256 << 20  # bytes mapped, or in memory, at once: each mapping takes a file descriptor
 _ALIGNMENT = 64  # bytes, a cache line
 
 
@@ -50,7 +50,7 @@ class ImageFile:
         granularity = mmap.ALLOCATIONGRANULARITY
         if self._segments:
             self._start += -(-len(self._segments[-1]) // granularity) * granularity
-        size = max(_SEGMENT, needed)
+        size = max(SEGMENT, needed)
         self._file.truncate(self._start + size)  # takes no room on the disk yet
         self._segments.append(mmap.mmap(
             self._file.fileno(), size, access=mmap.ACCESS_COPY, offset=self._start))

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.statistics import ROUNDING
 
 _ROUNDING = 1e-4  # of a matrix in float32 or in decimals that somebody wrote
-_ORTHOGONAL = 1e-6  # more than that is not a rotation; a product of ten rotations is off by 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Similarity:
             raise ValueError(f"rotation {rotation.shape} and translation {translation.shape}")
         # Written so that a NaN fails too.
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not (off < _ORTHOGONAL and np.linalg.det(rotation) > 0):
+        if not (off < ROUNDING and np.linalg.det(rotation) > 0):
             raise ValueError("the matrix of a similarity is not a rotation")
         if not np.isfinite(translation).all():
             raise ValueError("the translation of a similarity is not finite")

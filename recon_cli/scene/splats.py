@@ -16,7 +16,10 @@ from recon_cli.scene.backdrop import SPHERE_OPACITY, Backdrop, enclosing
 from recon_cli.scene.harmonics import rotate_sh
 from recon_cli.scene.similarity import Similarity
 
-SH_C0 = 0.28209479177387814  # the constant basis function, 1 / (2 sqrt(pi))
+SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant basis function
+EXTENT_SIGMAS = 3.0  # standard deviations of a Gaussian within which nearly all of it lies
+LEAST_OPACITY = 1e-6  # far below 1/255, and its logit is finite in float32
+MOST_OPACITY = 0.999  # likewise
 TERMS = (0, 3, 8, 15)  # coefficients a channel after the constant one, by degree
 
 

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.scene.statistics import COARSE_SAMPLE, FINE_SAMPLE, LEAST_SAMPLE
+
 # Thickness of a surface, as a share of the median distance of the points from their middle: 2.5 cm
 # in the rendered rooms, where points on the floor scatter by 1 to 2 cm.
 _THICKNESS = 0.015
-# Points that the searches look at; the fit of the floor takes all. The floor is a quarter of the
-# points, walls are a few per cent each.
-_FLOOR_SAMPLE, _WALL_SAMPLE = 4_000, 20_000
-_FEWEST = 100  # points; of fewer a share of 4% is a few, and no surface
 _REACH = 4.0  # median distances beyond which a point is taken for a stray
 _MAX_BELOW = 0.05  # share under a floor; 0.2% and 0.3% in rendered rooms, more if it mirrors
 _MIN_SHARE = 0.04  # of the points; 23% and 28% in the rendered rooms
@@ -57,10 +55,11 @@ def find_floor(
     Its normal lies within `cone_deg` of the unit vector `up`.
     """
     near, size = _near(points)
-    if len(near) < _FEWEST:
+    if len(near) < LEAST_SAMPLE:
         return None
     thick = _THICKNESS * size
-    sample = near[:: max(1, len(near) // _FLOOR_SAMPLE)]
+    # the floor is a quarter of the points; the fit takes all
+    sample = near[:: max(1, len(near) // COARSE_SAMPLE)]
     normal, height = up, 0.0
     for reach, step in ((cone_deg, 1.0), (1.0, 0.25)):  # a degree moves the rim by two thicknesses
         tilts = _tilt_directions(normal, reach, step)
@@ -84,9 +83,10 @@ def find_floor(
 def find_walls(points: NDArray[np.float64], up: NDArray[np.float64]) -> Walls:
     """Returns the horizontal direction along which the points line up best."""
     near, size = _near(points)
-    near = near[:: max(1, len(near) // _WALL_SAMPLE)]
+    # walls are a few per cent of the points each
+    near = near[:: max(1, len(near) // FINE_SAMPLE)]
     first = np.linalg.svd(up[None])[2][1]
-    if len(near) < _FEWEST:
+    if len(near) < LEAST_SAMPLE:
         return Walls(first, 1.0, False)
     flat = np.stack([near @ first, near @ np.cross(up, first)], axis=1)
     bins = _THICKNESS * size

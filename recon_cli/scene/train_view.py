@@ -15,9 +15,12 @@ if TYPE_CHECKING:  # ingest and denoise handle images without it: it takes a sec
     import torch
     from torch import Tensor
 
-MIN_SIDE = 11  # pixels; the window of SSIM
+# Of SSIM (Wang et al. 2004) of images in [0, 1]: standard deviation of its window, in pixels, and
+# what keeps its quotients finite.
+SSIM_SIGMA, SSIM_C1, SSIM_C2 = 1.5, 0.01**2, 0.03**2
+BORDER = 5  # pixels from the middle of the window to its side, which scores leave out
+MIN_SIDE = 2 * BORDER + 1  # pixels; the window
 MIN_PIXELS = MIN_SIDE**2  # that a mask must leave: one window of SSIM
-BORDER = MIN_SIDE // 2  # pixels; what SSIM leaves out, where the window reaches outside
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,6 @@ from recon_cli.workspace.steps import StepFolder
 VERDICT = "verdict.json"  # in the stage's folder: whether the model can be trusted
 DATABASE = "database.db"  # in the stage's folder: COLMAP's, of features and matches
 LOCK = "worker.lock"  # in the stage's folder: one mapping process at a time
-POLL_SECONDS = 0.25  # between looks at what native code has done
 CLIP_SECONDS = 1e6  # from the start of a clip to that of the next, in the times of a job
 STEPS = ("features", "matches", "model")
 SPLIT = "split"  # a step after the matches where a view graph is cut into segments

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.scene.splats import LEAST_OPACITY, MOST_OPACITY, SH_C0, Splats
 
+GROUP = 4  # Gaussians that one of the next level stands for, on the mean
 _NEIGHBOURS = 8  # that a Gaussian may be merged with
 _ROUNDS = 6  # of matching on one set of neighbours; most find a partner
 _COLOR = 10.0  # cost of a colour difference of 1, relative to a distance of one radius, squared
 _EVERY = 0.05  # cost of any merge, in the same unit
-_OPAQUE = 0.999  # the most that a merged opacity can be: its logit has to be finite
-_FAINT = 1e-6  # and the least
 
 Doubles = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -68,7 +67,7 @@ class Moments:
         variances, axes = np.linalg.eigh(self.covariance)
         axes[np.linalg.det(axes) < 0, :, 0] *= -1  # eigenvectors may form a mirror image
         scales = np.sqrt(np.maximum(variances, 1e-30))
-        opacity = np.clip(self.mass / _area(scales), _FAINT, _OPAQUE)
+        opacity = np.clip(self.mass / _area(scales), LEAST_OPACITY, MOST_OPACITY)
         values = {
             "means": self.mean, "quats": Rotation.from_matrix(axes).as_quat(scalar_first=True),
             "log_scales": np.log(scales), "logit_opacities": np.log(opacity / (1 - opacity)),

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.io.views import evenly_spread
+from recon_cli.scene.backdrop import AT_ONCE
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.splats.foreign import count_terms, drop_not_finite
@@ -38,14 +39,13 @@ from recon_cli.splats.values import (
 )
 from recon_cli.workspace.atomic import replacing
 
-_CHUNK = 256
 _AXES, _COLORS = ("x", "y", "z"), ("r", "g", "b")
 _PLACE = [f"{end}_{axis}" for end in ("min", "max") for axis in _AXES]
 _SCALE = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in _AXES]
 _COLOR = [f"{end}_{color}" for end in ("min", "max") for color in _COLORS]
 _BOUNDS = [*_PLACE, *_SCALE, *_COLOR]
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-_BITS, _SHIFTS = (11, 10, 11), (21, 11, 0)
+_BITS = (11, 10, 11)
 _SCALE_RANGE = 20.0  # of log scales; one of -1000 would leave the others of its chunk no bits
 _MOST_CENTERS = 32  # of the views, whose mean colour the rounding leaves alone
 _STEP = 1 / 32  # of a coefficient: 256 steps from -4 to 4
@@ -71,7 +71,7 @@ def write_compressed_ply(
     FormatError if there are no Gaussians, one is too large, or a parameter is not finite.
     """
     values = to_arrays(splats, path.name)
-    order = compact_order(values["means"], values["logit_opacities"], _CHUNK)
+    order = compact_order(values["means"], values["logit_opacities"], AT_ONCE)
     means, log_scales, quats, logits, sh_dc, sh_rest = (values[name][order] for name in (
         "means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest"))
     refuse_above(path, log_scales, _SCALE_RANGE)
@@ -83,9 +83,9 @@ def write_compressed_ply(
     bounds, (place, scale, color) = zip(*[_bound_chunks(part) for part in parts], strict=True)
     alpha = encode_opacities(logits).astype(np.uint32)
     words = np.stack([
-        _join_bits(place, _BITS, _SHIFTS), _rotation_words(quats),
-        _join_bits(scale, _BITS, _SHIFTS),
-        _join_bits(color, (8, 8, 8), (24, 16, 8)) | alpha], axis=1)
+        _join_bits(place, _BITS), _rotation_words(quats),
+        _join_bits(scale, _BITS),
+        _join_bits(color, (8, 8, 8)) << 8 | alpha], axis=1)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header(len(splats), sh_rest.shape[1], comments))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
@@ -96,35 +96,37 @@ def write_compressed_ply(
 def _header(n: int, terms: int, comments: Sequence[str]) -> bytes:
     rest = [f"uchar f_rest_{i}" for i in range(3 * terms)]
     return format_header({
-        "chunk": (-(-n // _CHUNK), [f"float {name}" for name in _BOUNDS]),
+        "chunk": (-(-n // AT_ONCE), [f"float {name}" for name in _BOUNDS]),
         "vertex": (n, [f"uint {name}" for name in _PACKED]), **({"sh": (n, rest)} if rest else {})},
         comments)
 
 
 def _bound_chunks(values: Floats) -> tuple[Floats, NDArray[np.float64]]:
     """Returns the bounds [chunks, 6] of values [N, 3], and their positions in them, 0 to 1."""
-    starts = np.arange(0, len(values), _CHUNK)
+    starts = np.arange(0, len(values), AT_ONCE)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-    rows = np.arange(len(values)) // _CHUNK
+    rows = np.arange(len(values)) // AT_ONCE
     width = (high.astype(np.float64) - low)[rows]
     share = (values - low[rows].astype(np.float64)) / np.where(width > 0, width, 1)
     return np.concatenate([low, high], axis=1), share
 
 
-def _join_bits(
-    shares: NDArray[np.floating], bits: tuple[int, ...], shifts: tuple[int, ...]
-) -> Words:
-    """Returns words [N] of shares [N, 3], each in that many bits."""
+def _join_bits(shares: NDArray[np.floating], bits: tuple[int, ...]) -> Words:
+    """Returns words [N] of shares [N, 3], each in that many bits, the last one lowest."""
     most = (1 << np.array(bits)) - 1
     fields = np.clip(np.rint(shares * most), 0, most).astype(np.uint32)
-    return np.asarray(np.bitwise_or.reduce(fields << np.array(shifts, np.uint32), axis=1))
+    return np.asarray(np.bitwise_or.reduce(fields << _shifts(bits), axis=1))
+
+
+def _shifts(bits: tuple[int, ...]) -> NDArray[np.uint32]:
+    return np.append(np.cumsum(bits[:0:-1])[::-1], 0).astype(np.uint32)
 
 
 def _rotation_words(quats: Floats) -> Words:
     largest, others = encode_smallest_three(quats)
     shares = others / np.sqrt(2) + 0.5
     index = largest.astype(np.uint32) << np.uint32(30)
-    return index | _join_bits(shares, (10, 10, 10), (20, 10, 0))
+    return index | _join_bits(shares, (10, 10, 10))
 
 
 def _harmonic_bytes(sh_rest: Floats) -> Bytes:
@@ -165,15 +167,15 @@ def load_compressed_ply(path: Path) -> LoadedScene:
     tables = read_tables(header)
     chunk, vertex = tables["chunk"], tables["vertex"]
     n = len(vertex)
-    if not n or len(chunk) != -(-n // _CHUNK):
-        raise FormatError(f"{path} has {len(chunk)} chunks of {_CHUNK} for {n} Gaussians.")
+    if not n or len(chunk) != -(-n // AT_ONCE):
+        raise FormatError(f"{path} has {len(chunk)} chunks of {AT_ONCE} for {n} Gaussians.")
     place, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
-    shares = _split_bits(color, (8, 8, 8), (24, 16, 8))
+    shares = _split_bits(color >> np.uint32(8), (8, 8, 8))
     colors = _interpolate(chunk, _COLOR, shares) if colored else shares
     columns = drop_not_finite(path, {
-        "means": _interpolate(chunk, _PLACE, _split_bits(place, _BITS, _SHIFTS)),
+        "means": _interpolate(chunk, _PLACE, _split_bits(place, _BITS)),
         "quats": _rotations(rotation),
-        "log_scales": _interpolate(chunk, _SCALE, _split_bits(scale, _BITS, _SHIFTS)),
+        "log_scales": _interpolate(chunk, _SCALE, _split_bits(scale, _BITS)),
         "logit_opacities": decode_opacities((color & 255).astype(np.uint8)),
         "sh_dc": (colors - 0.5) / SH_C0,
         "sh_rest": _harmonics(path, tables, n),
@@ -193,12 +195,10 @@ def _has(kinds: dict[str, str], names: list[str], kind: str) -> bool:
     return all(kinds.get(name) == kind for name in names)
 
 
-def _split_bits(
-    words: Words, bits: tuple[int, ...], shifts: tuple[int, ...]
-) -> NDArray[np.float64]:
+def _split_bits(words: Words, bits: tuple[int, ...]) -> NDArray[np.float64]:
     """Returns [N, 3] shares of words [N]: the inverse of `_join_bits`."""
     most = (1 << np.array(bits, np.uint32)) - 1
-    return (words[:, None] >> np.array(shifts, np.uint32) & most) / most
+    return (words[:, None] >> _shifts(bits) & most) / most
 
 
 def _interpolate(
@@ -207,13 +207,13 @@ def _interpolate(
     """Returns the values of shares [N, 3] of the chunks' bounds."""
     with np.errstate(invalid="ignore"):  # bounds that are not finite make NaN, which is refused
         bounds = np.stack([chunk[name].astype(np.float64) for name in names], axis=1)
-        rows = np.arange(len(shares)) // _CHUNK
+        rows = np.arange(len(shares)) // AT_ONCE
         low, high = bounds[rows, :3], bounds[rows, 3:]
         return np.asarray(low * (1 - shares) + high * shares)
 
 
 def _rotations(words: Words) -> Floats:
-    others = (_split_bits(words, (10, 10, 10), (20, 10, 0)) - 0.5) * np.sqrt(2)
+    others = (_split_bits(words, (10, 10, 10)) - 0.5) * np.sqrt(2)
     return decode_smallest_three((words >> 30).astype(np.int64), others.astype(np.float32))
 
 

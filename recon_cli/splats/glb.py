@@ -67,9 +67,9 @@ _SUPPORTED = (_NAME, "KHR_mesh_quantization")  # of the extensions that a file m
 _COLOR_SPACE = "srgb_rec709_display"
 _DEFAULTS = {"kernel": "ellipse", "colorSpace": _COLOR_SPACE}
 # Distance from 1 of the nearest opacity below it in float32: a logit has to be finite.
-_LEAST_OPACITY = 2.0 ** -24
+_LEAST_OPACITY = float(np.finfo(np.float32).epsneg)
 _LEAST_SCALE = float(np.finfo(np.float32).tiny)  # a flat Gaussian has a scale of 0
-_LEAST_BYTES = 12  # of a Gaussian: its position
+_LEAST_BYTES = np.dtype("3f4").itemsize  # of a Gaussian: its position
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MAGIC, _VERSION = b"glTF", 2
 _JSON, _BIN = b"JSON", b"BIN\0"

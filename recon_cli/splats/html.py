@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.statistics import FINE_SAMPLE, ROUNDING
 from recon_cli.splats.axes import UP, turn_from
 from recon_cli.splats.format import LoadedScene, SplatFormat, Tour, WriteSettings
 from recon_cli.splats.spz import (
@@ -65,12 +66,10 @@ MODULES = {
 LICENCES = ("LICENSE-three.txt", "LICENSE-spark.txt", "LICENSE-fflate.txt")
 _STORED = "rub"  # axes that the page turns back; the turn is its own inverse
 _LEVELS_FROM = 500_000  # Gaussians, of which Spark makes levels of detail
-_DISTANCE_SAMPLES = 20_000  # Gaussians, at most, that the distance of a view is measured on
 # At five, e^-10 units, the least scale, are .0015 units of the scene: in one of COLMAP, where some
 # ten are a room, less than a millimetre.
 _MOST_HALVINGS = 5
 _FINE = 0.01  # share of the Gaussians that may be finer, by their second axis, than SPZ holds
-_LEAST_SIZE = 1e-30  # units; a size of 0 has no logarithm
 _DEFAULT_LENS = (1200, 900, 1000.0)  # width, height and focal length in pixels
 
 
@@ -132,7 +131,7 @@ def _views(
     means = splats.means.detach().cpu().double().numpy()
     middle, radius = measure_extent(means)
     reach = radius or 1.0
-    sample = means[::-(-len(means) // _DISTANCE_SAMPLES)]
+    sample = means[::-(-len(means) // FINE_SAMPLE)]
     lenses: dict[tuple[float, ...], int] = {}
 
     def entry(camera: Camera) -> dict[str, Any]:
@@ -182,7 +181,6 @@ _CLOSED = b"</script>"
 _NUMBER = rb"(-?[0-9]{1,9}(?:\.[0-9]{1,20})?(?:e-?[0-9]{1,2})?)"
 _UP = re.compile(rb'<script id="views" type="application/json">\{"up":\['
                  + b",".join([_NUMBER] * 3) + rb"\]")
-_NEAR = 1e-6  # of a unit vector: rounding
 
 
 def write_html(
@@ -222,7 +220,7 @@ def _halvings(splats: Splats) -> int:
     fine = float(np.quantile(scales.median(dim=1).values.numpy(), _FINE))
     farthest = float(splats.means.detach().abs().max())
     room = min(-needed, math.log2(FARTHEST / max(farthest, fine)))
-    wanted = math.ceil(math.log2(SMALLEST_SCALE / max(fine, _LEAST_SIZE)))
+    wanted = math.ceil(math.log2(SMALLEST_SCALE / max(fine, float(np.finfo(np.float32).tiny))))
     return -max(0, min(wanted, math.floor(room)))
 
 
@@ -259,7 +257,7 @@ def load_html(path: Path) -> LoadedScene:
     stored = spz_scene(path, packed, axes=_STORED).splats
     found = _UP.search(data)
     up = next((name for name, axis in UP.items() if found and np.allclose(
-        axis, [float(number) for number in found.groups()], rtol=0, atol=_NEAR)), None)
+        axis, [float(number) for number in found.groups()], rtol=0, atol=ROUNDING)), None)
     return LoadedScene(_enlarged(stored, int(matches[0][3] or 0)), up)
 
 

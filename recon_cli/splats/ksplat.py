@@ -27,22 +27,20 @@ from recon_cli.splats.foreign import FLAT, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.values import decode_opacities, read_contents, splats_from_arrays
 
-_HEADER, _SECTION_HEADER = 4096, 1024
 _FILE = np.dtype({
     "names": ["major", "minor", "sections", "splats", "level", "least", "most"],
     "formats": ["u1", "u1", "<u4", "<u4", "<u2", "<f4", "<f4"],
-    "offsets": [0, 1, 4, 16, 20, 36, 40], "itemsize": _HEADER})
+    "offsets": [0, 1, 4, 16, 20, 36, 40], "itemsize": 4096})
 _SECTION = np.dtype({
     "names": ["splats", "room", "bucket_splats", "buckets", "bucket_side", "bucket_bytes",
               "steps", "full", "partial", "degree"],
     "formats": ["<u4", "<u4", "<u4", "<u4", "<f4", "<u2", "<u4", "<u4", "<u4", "<u2"],
-    "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40], "itemsize": _SECTION_HEADER})
+    "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40], "itemsize": 1024})
 # of positions, other vectors and coefficients, by compression level
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 _STEPS = 32767  # of half a bucket, where a section does not say
 _LIMIT = 1.5  # of coefficients, where the header does not say
 _DEGREES = 3  # 0, 1 and 2
-_CENTRE_BYTES = 12
 
 
 def read_ksplat(path: Path) -> Splats:
@@ -51,7 +49,7 @@ def read_ksplat(path: Path) -> Splats:
     Those that are not finite are dropped, with a warning. FormatError if the file is damaged.
     """
     data = read_contents(path)
-    if len(data) < _HEADER:
+    if len(data) < _FILE.itemsize:
         raise FormatError(f"{path} holds {len(data)} bytes, fewer than the header of a .ksplat.")
     header = np.frombuffer(data, _FILE, 1)[0]
     version, level = f"{header['major']}.{header['minor']}", int(header["level"])
@@ -59,11 +57,12 @@ def read_ksplat(path: Path) -> Splats:
         raise FormatError(
             f"{path} states version {version} and compression level {level}; versions 0.1 and "
             "levels 0 to 2 of .ksplat are read.")
-    start, count = _HEADER + _SECTION_HEADER * int(header["sections"]), int(header["splats"])
+    start = _FILE.itemsize + _SECTION.itemsize * int(header["sections"])
+    count = int(header["splats"])
     if start > len(data):
         raise FormatError(f"{path} states {header['sections']} sections, but ends before them.")
     sections = []
-    for section in np.frombuffer(data, _SECTION, int(header["sections"]), _HEADER):
+    for section in np.frombuffer(data, _SECTION, int(header["sections"]), _FILE.itemsize):
         values, start = _read_section(path, data, start, header, section)
         sections.append(values)
     found = sum(len(values["means"]) for values in sections)
@@ -108,7 +107,7 @@ def _decode_means(
     """Returns positions [N, 3] of their steps from the lowest corners of their buckets."""
     buckets, full, partial = (int(section[name]) for name in ("buckets", "full", "partial"))
     stride = int(section["bucket_bytes"])
-    if full + partial > buckets or (buckets and stride < _CENTRE_BYTES):
+    if full + partial > buckets or (buckets and stride < 3 * np.dtype(_TYPES[0][0]).itemsize):
         raise FormatError(f"{path} states {full} + {partial} of {buckets} buckets: it is damaged.")
     sizes = np.concatenate([
         np.full(full, section["bucket_splats"], np.int64),

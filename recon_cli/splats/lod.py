@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon_cli.scene.splats import Splats, joined, with_rows
-from recon_cli.splats.coarsen import coarsen
+from recon_cli.scene.splats import EXTENT_SIGMAS, Splats, joined, with_rows
+from recon_cli.splats.coarsen import GROUP, coarsen
 from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.sog import (
     META,
@@ -34,29 +34,33 @@ from recon_cli.splats.sog import (
     pack_splats,
     read_files,
 )
-from recon_cli.splats.values import Floats, UntrustedFile, describe_asset, normalize_quats
+from recon_cli.splats.values import (
+    MOST_PARTS,
+    Floats,
+    UntrustedFile,
+    describe_asset,
+    normalize_quats,
+)
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import remove
 from recon_cli.workspace.paths import leads_out
 
 LOD_META = "lod-meta.json"
 _VERSION = 1
-_QUARTER = 4  # how many times fewer Gaussians the next level has
 _LEVELS = 6  # at most
-_COARSEST = 30_000  # Gaussians of a level that needs no further one: they are loaded in a moment
-_LEAF = 30_000  # Gaussians of level 0 in a leaf, at most
-_FILE = 120_000  # from which a file of one level is full: half a second on a slow line
-_SIGMAS = 3.0  # of a Gaussian within the box of its leaf
+# Gaussians of level 0 in a leaf, at most, and of a level that needs no further one: they are loaded
+# in a moment; and those from which a file of one level is full: half a second on a slow line.
+_LEAF = 30_000
+_FILE = 4 * _LEAF
 _META_LIMIT = 64 << 20  # bytes
-_FILES_LIMIT = 1 << 16
 _FOLDER = re.compile(r"\d+_\d+")  # a file of a level: {level}_{number}
 
 
 def make_levels(splats: Splats) -> list[Splats]:
     """Returns the scene, and versions of ever fewer Gaussians."""
     levels = [splats]
-    while len(levels[-1]) > _COARSEST and len(levels) < _LEVELS:
-        levels.append(coarsen(levels[-1], len(levels[-1]) // _QUARTER))
+    while len(levels[-1]) > _LEAF and len(levels) < _LEVELS:
+        levels.append(coarsen(levels[-1], len(levels[-1]) // GROUP))
     return levels
 
 
@@ -189,7 +193,7 @@ class _Tree:
         quats = normalize_quats(splats.quats.detach().cpu().float().numpy())
         axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
         axes *= splats.scales.detach().cpu().numpy()[:, None]
-        reach = _SIGMAS * np.sqrt(np.square(axes).sum(axis=2))
+        reach = EXTENT_SIGMAS * np.sqrt(np.square(axes).sum(axis=2))
         means = splats.means.detach().cpu().numpy().astype(np.float64)
         np.minimum.at(self._low, leaf, means - reach)
         np.maximum.at(self._high, leaf, means + reach)
@@ -266,7 +270,7 @@ class _Index(UntrustedFile):
         # files from before version 1 do not have a number
         self.integer(self.meta, "version", _VERSION, _VERSION, default=_VERSION)
         names = self.meta.get("filenames")
-        if not isinstance(names, list) or len(names) > _FILES_LIMIT or not all(
+        if not isinstance(names, list) or len(names) > MOST_PARTS or not all(
                 isinstance(name, str) for name in names):
             raise self.error(f"filenames = {names!r:.40}; needed is a list of names")
         self.names: list[str] = names

@@ -9,9 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.scene.splats import Splats, joined, with_rows
-from recon_cli.splats.coarsen import Moments, Rows, match_pairs, merge_pairs
-
-_GROUP = 4  # Gaussians that one stands for, on the mean
+from recon_cli.splats.coarsen import GROUP, Moments, Rows, match_pairs, merge_pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +35,7 @@ def build_tree(splats: Splats) -> MergeTree:
     parts, members, sizes = [scene], [np.zeros(0, np.int64)], [np.zeros(count, np.int64)]
     made = count
     while len(nodes) > 1:
-        moments, label = _group(moments, max(1, len(nodes) // _GROUP))
+        moments, label = _group(moments, max(1, len(nodes) // GROUP))
         size = np.bincount(label)
         several = size > 1
         members.append(nodes[np.argsort(label, kind="stable")][np.repeat(several, size)])

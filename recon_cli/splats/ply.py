@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
+from recon_cli.scene.statistics import ROUNDING
 from recon_cli.splats.foreign import (
     FLAT,
     NOT_GAUSSIANS_HINT,
@@ -70,7 +71,6 @@ _MAX_LOGIT = math.log(254.75 / 0.25)
 MIN_OPACITY = 0.5  # fainter Gaussians are rarely surfaces
 # the comment in the header: how many rows at the end show a backdrop, and its numbers
 _BACKDROP = re.compile(r"backdrop (\d{1,9})((?: \S+){7})")
-ROUNDING = 1e-6  # of a value: by how much two machines may differ
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 logger = logging.getLogger("recon")

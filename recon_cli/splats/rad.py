@@ -29,6 +29,7 @@ from recon_cli.splats.foreign import FLAT, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.merge_tree import MergeTree, build_tree
 from recon_cli.splats.values import (
+    MOST_PARTS,
     UntrustedFile,
     refuse_not_finite,
     sigmoid,
@@ -38,7 +39,7 @@ from recon_cli.splats.values import (
 from recon_cli.workspace.atomic import write_bytes
 
 _MAGIC, _CHUNK_MAGIC = b"RAD0", b"RADC"
-_MOST_SPLATS, _MOST_CHUNKS, _CHUNK = 1 << 31, 1 << 16, 1 << 16
+_MOST_SPLATS, _CHUNK = 1 << 31, 1 << 16
 _WORD = 8  # bytes, to which everything is filled up
 _BAND = {1: 9, 2: 15, 3: 21}  # coefficients of three channels, by degree
 _LEAST = 0.25 / 255  # of an opacity, as in the other formats of bytes
@@ -108,7 +109,7 @@ class _RadFile(UntrustedFile):
     def _open_chunks(self) -> list[_Chunk]:
         """Returns the chunks, no two of which share a byte; nothing is unpacked."""
         entries = self.meta.get("chunks")
-        if not isinstance(entries, list) or not 0 < len(entries) <= _MOST_CHUNKS:
+        if not isinstance(entries, list) or not 0 < len(entries) <= MOST_PARTS:
             raise self.error(f"chunks = {entries!r:.40}; needed is a list")
         places = []
         for entry in entries:

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.scene.splats import TERMS, Splats
+from recon_cli.scene.splats import LEAST_OPACITY, TERMS, Splats
 from recon_cli.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
 from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.values import (
@@ -51,7 +51,6 @@ from recon_cli.splats.values import (
 from recon_cli.workspace.atomic import read_bytes, write_bytes
 from recon_cli.workspace.paths import leads_out
 
-_LEAST_OPACITY = 1e-6  # that PlayCanvas reads for a byte of 0; a logit has to be finite
 ROW = 64  # palette entries in a row of their image
 _TAG = 252  # of a quaternion whose greatest component is w
 _ROOT2 = math.sqrt(2)  # only the greatest component of a unit quaternion exceeds 1 / sqrt(2)
@@ -62,7 +61,6 @@ _SMALL = 1 << 20  # Gaussians or pixels that are always accepted: a few hundred 
 _START, _ENTRY = b"PK\x03\x04", b"PK\x01\x02"  # of the file, and of each entry of its directory
 _ENTRIES = 64  # a .sog has eight
 _HEADER = 1 << 16  # bytes of an image beside its pixels
-_DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip can hold: the same scene, the same bytes
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others cannot be stopped at a bound
 Doubles = NDArray[np.float64]
 
@@ -177,7 +175,7 @@ def read_files(archive: SogFiles) -> Splats:
         "quats": decode_smallest_three(
             turns[:, 3].astype(np.int64) - _TAG, (turns[:, :3] / 255 * 2 - 1) / _ROOT2),
         "log_scales": archive.look_up(rows(*archive.files(scales, 1))[:, :3], scales),
-        "logit_opacities": logit(colors[:, 3] / 255, _LEAST_OPACITY),
+        "logit_opacities": logit(colors[:, 3] / 255, LEAST_OPACITY),
         "sh_dc": archive.look_up(colors[:, :3], sh0),
         "sh_rest": _read_harmonics(archive, meta, rows),
     })
@@ -396,14 +394,17 @@ class Unpacked(SogFiles):
 
 
 def pack_archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
-    """Returns the bytes of a .sog with images [H, W, 3] or [H, W, 4] by name; deterministic."""
+    """Returns the bytes of a .sog with images [H, W, 3] or [H, W, 4] by name.
+
+    The same scene gives the same bytes: the date of all is the earliest that a zip can hold.
+    """
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         text = json.dumps(meta, separators=(",", ":"), allow_nan=False)
-        archive.writestr(zipfile.ZipInfo(META, _DATE), text)
+        archive.writestr(zipfile.ZipInfo(META), text)
         with ThreadPoolExecutor(2) as pool:  # more take memory for little
             for name, encoded in zip(images, pool.map(encode_webp, images.values()), strict=True):
-                archive.writestr(zipfile.ZipInfo(name, _DATE), encoded)
+                archive.writestr(zipfile.ZipInfo(name), encoded)
     return data.getvalue()
 
 

@@ -64,7 +64,8 @@ from recon_cli.workspace.atomic import write_bytes
 logger = logging.getLogger("recon")
 
 _FEWEST_BITS, POSITION_BITS = 8, 12  # fractional bits of a position: fewest, and Niantic's
-_MOST = (1 << 23) - 1  # of a position, in fractions
+_MAX_FRACTIONAL_BITS = 24  # as a position has in all
+_MOST = (1 << _MAX_FRACTIONAL_BITS - 1) - 1  # of a position, in fractions
 # Of the median Gaussian's size, by which a position is rounded. In a close-up of 0.2 mm Gaussians
 # 1/10 loses .34 dB, 1/20 .16 and 1/40 .11; each halving takes 2% more bytes.
 _ROUNDING = 1 / 32
@@ -79,7 +80,7 @@ _HARMONIC = 128
 # and loses .003 dB; in steps of 4 it loses .2 dB. Niantic's program uses 8 and 16.
 _HARMONIC_STEP = 2
 _MAGNITUDE = 511  # of a component of a rotation; 9 bits and a sign
-_WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
+_XYZW = [1, 2, 3, 0]
 VERSIONS = (2, 3, 4)  # that are written
 _HALVES = 1  # the version whose positions are float16
 _MAGIC = b"NGSP"
@@ -94,8 +95,7 @@ _GZIP_HEADER = b"\x1f\x8b\x08\x10\0\0\0\0\0\xff"
 _COMMENT = re.compile(re.escape(_GZIP_HEADER) + rb"([ -~]{,40})\0")
 # Coefficients a channel that a file may have; those above degree 3 are cut off.
 _FILE_TERMS = (*TERMS, 24)
-_MAX_FRACTIONAL_BITS = 24
-_GZIP_LEVEL, _ZSTD_LEVEL = 6, 12  # those of Niantic's program
+_ZSTD_LEVEL = 12  # of Niantic's program, whose level of gzip is that of zlib
 
 
 class _Flag(IntFlag):
@@ -255,7 +255,7 @@ def _rotations(data: Bytes) -> Floats:
     sizes = (fields & _MAGNITUDE) / (np.sqrt(2) * _MAGNITUDE)
     others = np.where(fields & 512, -sizes, sizes).astype(np.float32)
     largest: NDArray[np.int64] = (word[:, 0] >> 30).astype(np.int64)
-    return decode_smallest_three(largest, others)[:, _WXYZ]
+    return decode_smallest_three(largest, others)[:, np.argsort(_XYZW)]
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ def pack(header: SpzHeader, arrays: list[Bytes]) -> bytes:
 
 def _gzip(data: bytes, up: str | None) -> bytes:
     """Returns a stream of gzip whose header says which axis is up; the same bytes at any time."""
-    packer = zlib.compressobj(_GZIP_LEVEL, wbits=-zlib.MAX_WBITS)
+    packer = zlib.compressobj(wbits=-zlib.MAX_WBITS)
     comment = up_comment(up).encode("ascii")
     return b"".join([_GZIP_HEADER, comment, b"\0", packer.compress(data), packer.flush(),
                      struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)])

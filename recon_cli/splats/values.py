@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import Splats, with_rows
+from recon_cli.scene.voxels import BITS
 from recon_cli.splats.axes import UP
 
 BULK = 0.9  # share of the Gaussians that determines the size of a scene; some lie far away
 _FAR = 10.0  # times the median distance of all from their middle
 _SHELL = 1.5  # outer distance over the inner one
-_BITS = 21  # per axis; three make a word of 63
 _LARGEST = float(np.finfo(np.float32).max)
 # Limits of what a file unpacks to. A .spz whose harmonics are all 0 reaches 5 times its size.
 HARMLESS_BYTES, MAX_RATIO = 1 << 24, 128
+MOST_PARTS = 1 << 16  # of a scene: files or chunks
 MOST_HEAD_BYTES = 1 << 20  # of what describes a file; most need a hundredth of it
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -46,7 +47,7 @@ def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
     exact = points.astype(np.float64)
     low, high = exact.min(axis=0), exact.max(axis=0)
     width = np.where(high > low, high - low, 1)
-    cells = ((exact - low) / width * ((1 << _BITS) - 1)).astype(np.uint64)
+    cells = ((exact - low) / width * ((1 << BITS) - 1)).astype(np.uint64)
     return np.argsort(morton_codes(cells), kind="stable")
 
 

@@ -8,6 +8,7 @@ scored: they are painted in one colour in truth/ and black in difference/.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,7 @@ from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
     CONVENTION_LINES,
     CONVENTIONS,
+    ERROR_GAIN,
     FACES_CONVENTION,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
@@ -61,19 +63,16 @@ from recon_cli.train.fit.runner import LOG, seconds_at
 from recon_cli.train.fit.train_data import read_config
 from recon_cli.train.masks import read_summary, with_masks
 from recon_cli.train.parts.moving import FINER, ViewComparer, find_in_held_out
-from recon_cli.train.parts.moving_regions import SIDE
+from recon_cli.train.parts.part import SEARCH_SIDE
 from recon_cli.train.parts.photometry import read_falloffs
 from recon_cli.trust.assess import TrustTask, assess
 from recon_cli.workspace.atomic import write_json, write_text
 from recon_cli.workspace.records import Frame, ImportRecord, describe_stretches, read_frame_list
 from recon_cli.workspace.summaries import EvaluateSummary, WorldSummary
 
-_GAIN = 4  # of the difference images
-_ANY_ITERATION = 1 << 62  # beyond the last
 _SEEN_VIEWS = 20  # training and validation views that are also scored, at most
 _STAGES = {"base": "train", "pruned": "prune"}  # by model
 _ROOM = 512 << 20  # bytes of images that trust need not render again: 130 views of 600x340
-_STRETCHES = 5  # of frames that are left out, in the tables
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class _Evaluation:
                             falloffs=falloffs, on_view=seen)
             for name, views in self.training_views.items()}
         log = self.folders[model] / LOG
-        seconds = None if self.import_record else seconds_at(log, _ANY_ITERATION)
+        seconds = None if self.import_record else seconds_at(log, sys.maxsize)
         return ModelMetrics.from_views(
             scores.views, gaussians=len(splats),
             bytes=(self.folders[model] / "splats.ply").stat().st_size,
@@ -262,7 +261,7 @@ def _find_moving(
         return {}
     splats = read_ply(train / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
     training = load_reference_views(
-        with_masks(scene, train).train, FINER * SIDE, threads=ctx.threads)
+        with_masks(scene, train).train, FINER * SEARCH_SIDE, threads=ctx.threads)
     regions = find_in_held_out(
         splats, held_out, training, ViewComparer(config.sh_degree, ctx.backend))
     return {view.name: region for view, region in zip(held_out, regions, strict=True)
@@ -276,7 +275,7 @@ def _save_pictures(
     """Saves the render of a held-out view, and its difference from the photo."""
     name, rendered = f"{Path(frame).stem}.png", to_uint8(image)
     _save(out / "renders" / model / name, rendered)
-    difference = np.abs(rendered.astype(np.int16) - photo) * _GAIN
+    difference = np.abs(rendered.astype(np.int16) - photo) * ERROR_GAIN
     if mask is not None:
         difference[~mask] = 0
     _save(out / "difference" / model / name, difference.clip(0, 255).astype(np.uint8))
@@ -316,7 +315,7 @@ def _write(
     note = evaluation.note(lacking)
     if metrics.coverage:
         stretches = describe_stretches(evaluation.frames, metrics.unregistered or ())
-        note += f"{metrics.coverage}: {list_names(stretches, _STRETCHES)}\n"
+        note += f"{metrics.coverage}: {list_names(stretches)}\n"
     for label, model in by_label.items():
         note += f"{label}, {_gap(model)}\n"
         if moving := metrics.describe_moving(model):

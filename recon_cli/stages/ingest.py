@@ -18,7 +18,7 @@ from recon_cli.datasets import from_data_set
 from recon_cli.datasets.layouts import recognise, refuse_incomplete
 from recon_cli.errors import InputError, format_count
 from recon_cli.io.tracks import TRACKS
-from recon_cli.sfm.segments.segments import MOST_UNSPLIT
+from recon_cli.sfm.limits import FEW_FRAMES
 from recon_cli.workspace import records as store
 from recon_cli.workspace.records import FrameList, Group
 from recon_cli.workspace.summaries import IngestSummary
@@ -153,7 +153,7 @@ def _find_only_video(path: Path, out: Path, ctx: StageContext) -> Path:
 
 def _tell_many(config: IngestConfig, frames: int, ctx: StageContext) -> None:
     """Says how many frames a long video gets; sfm tells how long their cameras take to find."""
-    if frames > MOST_UNSPLIT:
+    if frames > FEW_FRAMES:
         way = "" if config.frames else " for the way of the camera"
         ctx.notice(f"{frames:,} frames are chosen{way}; --max-frames limits their number.")
 

@@ -22,8 +22,6 @@ from recon_cli.workspace import records as store
 from recon_cli.workspace.records import POSES, FrameList, describe_stretches
 from recon_cli.workspace.summaries import PlacedPart, PlaceSummary, SfmSummary
 
-STRETCHES = 8  # of frames without a camera, in a sentence
-
 
 def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> PlaceSummary:
     """Writes sparse/, world.json and undistorted/{images,denoised,sparse} into `out`.
@@ -173,4 +171,4 @@ def _describe_left_out(
 
 
 def _stretches(frames: FrameList, names: Collection[str]) -> str:
-    return list_names(describe_stretches(frames.frames, names), STRETCHES)
+    return list_names(describe_stretches(frames.frames, names))

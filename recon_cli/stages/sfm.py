@@ -28,7 +28,7 @@ from recon_cli.workspace.steps import StepFolder
 from recon_cli.workspace.summaries import MappedParts, SfmSummary
 
 # 292 photos took 15 minutes with all that was tried, on two busy cores, and 170 photos 11.
-MAX_MINUTES, USUAL_FRAMES, MINUTES_PER_FRAME = 20.0, 100, 0.2
+USUAL_FRAMES, MINUTES_PER_FRAME = 100, 0.2
 NEAR_LIMIT = 0.5  # share of the limit from which on the notice names the limit
 
 
@@ -116,7 +116,7 @@ def _time_limit(config: SfmConfig, frames: FrameList) -> float:
     """Returns the limit in minutes: as asked for, or by the number of frames."""
     if config.max_minutes is not None:
         return config.max_minutes
-    return MAX_MINUTES + MINUTES_PER_FRAME * max(0, len(frames.frames) - USUAL_FRAMES)
+    return MINUTES_PER_FRAME * max(USUAL_FRAMES, len(frames.frames))
 
 
 def _tell_time(config: SfmConfig, job: MappingJob, ctx: StageContext) -> None:

@@ -33,7 +33,6 @@ from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace.records import Frame, read_frame_list
 from recon_cli.workspace.summaries import TrainSummary
 
-_NAMES = 5  # of masks without a view, in a notice
 EVERY = 8  # views from one that is held out to the next, sorted by name, the first one included
 MAX_WIDTH = 1600  # pixels; INRIA's code reduces wider images to it
 
@@ -51,7 +50,7 @@ def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
     edited = EditedMasks() if model is not None else EditedMasks.find(inputs.earlier)
     if unused := edited.unused(masked_views(scene)):
         ctx.notice(f"{format_count(len(unused), 'mask')} in train/masks of no view that training "
-                   f"reads: {list_names(unused, _NAMES)}")
+                   f"reads: {list_names(unused)}")
     if count > 1:
         return _train_in_blocks(config, count, scene, inputs, out, ctx, edited)
     return fit_scene(config, scene, out, ctx, model, edited)

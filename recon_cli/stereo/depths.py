@@ -25,14 +25,14 @@ _LEAST_SIDE = 8  # pixels of any side; windows have 5
 # the best angle depth is uncertain, far beyond it surfaces look different.
 _ANGLE, _NARROWER, _WIDER = 5.0, 1.5, 8.0  # degrees: the best, and standard deviations
 _LEAST_ANGLE = 1.0  # degrees; below it all depths look alike
-_LEAST_SHARED = 10  # points that two views must both see
+LEAST_SEEN = 10  # points that a view, or two together, must see
 # The first search, at half the size: inverse depths evenly spread, over more than the surface spans
 _HYPOTHESES, _RADIUS = 64, 1
-_NEARER, _FARTHER = 0.7, 1.4
-_COMPARED = 14  # partners at most; what is level or refined is compared with all
+_BEYOND = (0.7, 1.4)
+COMPARED = 14  # partners of a view at most; what is level or refined is compared with all
 # and along level planes, by their distance from the camera in median depths: in rooms from 65 cm,
 # which a table top lies below a standing person's eyes, to 3 m
-_LEVELS, _LOWEST, _HIGHEST = 32, 0.25, 1.2
+_LEVELS, _HEIGHTS = 32, (0.25, 1.2)
 # The second one, about what the first found: a window then follows slanted surfaces.
 _REFINED, _FINER, _REFINED_RADIUS = 9, 4, 2
 EDGE = 0.03  # of an inverse depth; larger steps between pixels are edges of things
@@ -97,15 +97,16 @@ def find_depths(
     """
     full = [(photo.grey, photo.view.camera) for photo in photos]
     half = [_halved(*image) for image in full]
-    ranges = np.array([(1 / (_FARTHER * photo.farthest), 1 / max(_NEARER * photo.nearest, near))
+    near_share, far_share = _BEYOND
+    ranges = np.array([(1 / (far_share * photo.farthest), 1 / max(near_share * photo.nearest, near))
                        for photo in photos])
     lowest = np.ascontiguousarray(ranges[:, 0])
     steps = (ranges[:, 1] - lowest) / (_HYPOTHESES - 1)
     base = [np.zeros(image.shape, np.float32) for image, _ in half]
     sweeps = [_Sweep(
-        partners[:, :_COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
+        partners[:, :COMPARED], base, lowest, steps, _HYPOTHESES, _RADIUS, _FRONTAL)]
     if levels:
-        first, last = 1 / (_HIGHEST * levels.median), 1 / (_LOWEST * levels.median)
+        first, last = 1 / (_HEIGHTS[1] * levels.median), 1 / (_HEIGHTS[0] * levels.median)
         step = (last - first) / (_LEVELS - 1)
         sweeps.append(_Sweep(
             partners, base, np.full(len(photos), first), np.full(len(photos), step), _LEVELS,
@@ -142,7 +143,7 @@ def find_partners(
         spread = np.where(angles < _ANGLE, _NARROWER, _WIDER)
         both = seen[:, mine] & (angles >= _LEAST_ANGLE)
         worth = (both * np.exp(-0.5 * ((angles - _ANGLE) / spread) ** 2)).sum(axis=1)
-        worth[both.sum(axis=1) < _LEAST_SHARED] = 0
+        worth[both.sum(axis=1) < LEAST_SEEN] = 0
         worth[own] = 0
         best = np.argsort(-worth, kind="stable")[:most]
         best = best[worth[best] > 0]
@@ -167,8 +168,20 @@ def compile_kernels() -> None:
                 np.array([[1], [0]]), near=0.1)
 
 
+NEAREST = 0.02  # of the median depth; nothing nearer to a camera is a surface
+
+
+def spanned(depths: NDArray[np.floating]) -> tuple[float, float]:
+    """Returns how near and how far a view is searched: between the outer hundredths of [N]."""
+    near, far = np.quantile(depths, [0.01, 1 - 0.01])
+    return float(near), float(far)
+
+
+CAMERA_NUMBERS = 9 + 3 + 6  # rotation, translation, and focal lengths to size
+
+
 def camera_row(camera: Camera) -> NDArray[np.float64]:
-    """Returns a camera as the kernels read it, [18]."""
+    """Returns a camera as the kernels read it, [CAMERA_NUMBERS]."""
     return np.concatenate([
         camera.viewmat[:3, :3].reshape(-1), camera.viewmat[:3, 3],
         [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]])

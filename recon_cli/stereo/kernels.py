@@ -23,7 +23,7 @@ _LEAST_PENALTY = 0.15  # of the larger one, across any edge
 # Of planes through blank regions:
 _REACH, _STRIDE = 12, 2  # pixels; every second one is looked at
 _GREY = 5.0  # standard deviation of grey levels that belong to a region
-_FIRST_SPREAD, _SPREAD, _ROUNDS = 1.0, 0.6, 3  # hypotheses off a plane, at first and then
+_SPREADS = (1.0, 0.6, 0.6)  # hypotheses off a plane, in each round
 _UNSURE = 0.01  # weight of a depth that no other view agrees with
 _CUT = 8.0  # squared deviations from which on a pixel counts nothing
 _SLOPE = 0.5  # squared pixels added to the spread of places: few of them tell no slope
@@ -391,8 +391,8 @@ def lay_planes(counter, inverse, image, confirmed, blank, step, plane_depth):
             if blank[y, x] < _LEAST_BLANK or at <= 0:
                 continue
             grey = 1 / (_GREY * _GREY)
-            for turn in range(_ROUNDS):
-                spread = step * (_FIRST_SPREAD if turn == 0 else _SPREAD)
+            for turn in range(len(_SPREADS)):
+                spread = step * _SPREADS[turn]
                 depth = 1 / (spread * spread)
                 n = sx = sy = sv = xx = xy = yy = xv = yv = 0.0
                 for j in range(-_REACH, _REACH + 1, _STRIDE):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from recon_cli.context import EarlierResult
 from recon_cli.errors import FormatError, Hint, InputError, ManifestError
-from recon_cli.io.images import decode_file, fill_masked, read_mask, write_png
+from recon_cli.io.images import HALF, decode_file, fill_masked, read_mask, write_png
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import read_json, write_json
@@ -27,8 +27,6 @@ from recon_cli.workspace.layout import link_or_copy, remove
 from recon_cli.workspace.summaries import MovingSummary
 
 FOLDER = "masks"  # in the folder of the training
-_COUNTS = 255
-_HALF = 128  # in a mask of a user, as in those of photos: from this value on a pixel counts
 
 logger = logging.getLogger("recon")
 Counts = NDArray[np.bool_]
@@ -83,7 +81,7 @@ class EditedMasks:
                 hint="Draw it over the picture of that name in place/undistorted/images.")
         grey = cv2.resize(image.max(axis=2), (camera.width, camera.height),
                           interpolation=cv2.INTER_NEAREST_EXACT)
-        return np.asarray(grey >= _HALF)
+        return np.asarray(grey >= HALF)
 
     def unused(self, views: Sequence[View]) -> list[str]:
         """Returns the names of edited masks of no view that training reads."""
@@ -127,7 +125,7 @@ def write_masks(
         if view.mask is not None:
             counts &= read_mask(view.mask, view.camera.width, view.camera.height)
         (out / FOLDER).mkdir(parents=True, exist_ok=True)
-        write_png(out / FOLDER / file_name(view), counts.astype(np.uint8) * _COUNTS)
+        write_png(out / FOLDER / file_name(view), np.where(counts, 255, 0).astype(np.uint8))
     if not shares:
         return None
     summary = MovingSummary(shares=shares, by_hand=tuple(by_hand), views=len(views))
@@ -182,7 +180,7 @@ def join_masks(out: Path, folders: Sequence[Path], scene: Scene) -> None:
         counts = np.logical_and.reduce([read_mask(path, width, height) for path in found])
         shares[view.name] = round(1 - float(counts.mean()), 4)
         (out / FOLDER).mkdir(parents=True, exist_ok=True)
-        write_png(out / FOLDER / name, counts.astype(np.uint8) * _COUNTS)
+        write_png(out / FOLDER / name, np.where(counts, 255, 0).astype(np.uint8))
     if shares:
         write_json(out / MovingSummary.FILE, MovingSummary(
             shares=shares, by_hand=by_hand, views=len(views)).to_json())

@@ -53,8 +53,7 @@ CALIBRATION_SHARE = 0.05  # of the minutes, at most
 LEAST_STEPS = 0.15  # of the quality's steps, below which a scene is blurred: the user is told
 CALIBRATION_SECONDS = 0.5  # where no time is given: a twentieth of a draft
 
-_SMALLEST_RUN = 100  # steps; fewer show nothing of a room
-_LONGEST_RUN = 100_000  # steps; three times the reference's
+_RUN = (100, 100_000)  # steps; fewer show nothing of a room, more are three times the reference's
 _DETAIL = 4.0  # grey levels a pixel; camera noise stays below it after denoising
 _DETAIL_VIEWS = 16  # looked at; the mean of more differs by less than 3%
 _FULL_AT = 2400  # steps after which there may be a Gaussian for each pixel with detail
@@ -141,7 +140,7 @@ def make_plan(
     if asked.minutes is None:
         return at(first_config(asked).iterations)
     left = 60 * asked.minutes - estimator.seconds if left is None else left
-    return at(_largest(lambda steps: at(steps).seconds <= left, _SMALLEST_RUN, _LONGEST_RUN))
+    return at(_largest(lambda steps: at(steps).seconds <= left, *_RUN))
 
 
 def cap(asked: TrainConfig, facts: Facts, iterations: int) -> int:

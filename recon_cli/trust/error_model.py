@@ -40,11 +40,9 @@ TERMS = tuple(PRIOR)
 _RIDGE = 0.1
 _MAX_WEIGHT = 6.0
 _PIXELS = 60_000  # that the fit looks at
-_COVERED = 1e-3  # alpha below which a pixel shows nothing
 _ANGLE = 0.05  # rad; smaller ones count alike, as one step of a walk
 _SPREAD = 0.02  # of the depth, and of the intensity: smaller spreads along a ray count alike
-_ERROR = 1e-3  # a quarter of an 8-bit step
-_SHARE = 1e-3  # of 1 / (1 + views)
+_LEAST = 1e-3  # of alpha, of 1 / (1 + views), and of an error: a quarter of an 8-bit step
 _EDGE = 3e-3  # intensity a pixel
 MIN_BIAS_ERROR = 1e-6
 
@@ -85,8 +83,8 @@ def gaussian_terms(support: ViewSupport, sight: ViewingGeometry) -> dict[str, ND
 def _shape_terms(
     few: NDArray[Any], angle: NDArray[Any], residual: NDArray[Any], nearer: NDArray[Any]
 ) -> dict[str, NDArray[Any]]:
-    return {"few": np.log(few.clip(0) + _SHARE), "angle": np.log1p(angle.clip(0) / _ANGLE),
-            "residual": np.log(residual.clip(0) + _ERROR), "nearer": nearer.clip(0)}
+    return {"few": np.log(few.clip(0) + _LEAST), "angle": np.log1p(angle.clip(0) / _ANGLE),
+            "residual": np.log(residual.clip(0) + _LEAST), "nearer": nearer.clip(0)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +113,7 @@ def picture_terms(model: RenderedModel, support: ViewSupport, camera: Camera) ->
         second = paint(splats, camera, [(depth / scale).square(), sight.nearer, bright.square()],
                        backend)
     rgb, alpha = images.rgb, images.alpha
-    covered = alpha >= _COVERED
+    covered = alpha >= _LEAST
     share = np.where(covered, alpha, 1)
     mean_depth = images.depth / share / scale
     behind = float(splats.background.mean())

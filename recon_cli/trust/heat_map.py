@@ -10,7 +10,7 @@ FULL = int(np.iinfo(np.uint16).max)  # steps of a picture for an error of 1, all
 # Errors that are drawn blue and red; between them colours follow the logarithm, the same in every
 # scene. Two rendered rooms have .004 to .07 between the best and the worst tenth of the pixels.
 TRUSTED, INVENTED = 0.005, 0.2
-_BLUE, _RED = 0.1, 0.95  # of the colour map, whose ends are nearly black
+_SPAN = (0.1, 0.95)  # of the colour map, whose ends are nearly black
 _TINT = 0.65  # of a tinted colour
 
 
@@ -22,7 +22,7 @@ def error_steps(expected: NDArray[np.float32]) -> NDArray[np.uint16]:
 def heat_colors(expected: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Returns colours [..., 3] of expected errors [...]: blue is trusted, red is unreliable."""
     share = np.log(np.maximum(expected, 1e-6) / TRUSTED) / np.log(INVENTED / TRUSTED)
-    level = _BLUE + (_RED - _BLUE) * np.clip(share, 0, 1)
+    level = _SPAN[0] + (_SPAN[1] - _SPAN[0]) * np.clip(share, 0, 1)
     steps = np.rint(255 * level).astype(np.uint8).reshape(1, -1)
     colors = cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[0, :, ::-1]
     return np.asarray(colors, np.uint8).reshape(*expected.shape, 3)

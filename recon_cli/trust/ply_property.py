@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon_cli.scene.splats import Splats
-from recon_cli.splats.ply import ROUNDING
+from recon_cli.scene.statistics import ROUNDING
 from recon_cli.trust.scene_trust import Trust
 from recon_cli.trust.support import ViewingGeometry
 

@@ -14,11 +14,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from recon_cli.errors import MOST_NAMED
+from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.trust.support import ViewSupport
-from recon_cli.trust.surface import CELL, MIN_SPAN_DEG, MIN_VIEWS, SurfaceCells
+from recon_cli.trust.surface import CELL, MIN_SPAN_DEG, SurfaceCells
 from recon_cli.workspace.summaries import JsonRecord
 
-MOST = 5  # regions that are listed
 _LEAST = 0.002  # of the surface; smaller regions are noise around edges
 _BLOCK = 3  # cells: what lies so near together, some 20 cm in a room, is one region
 _LONGEST = round(1 / CELL)  # cells: a longer region is cut, so that its place says where it is
@@ -58,7 +59,7 @@ def find_poorly_seen(
 ) -> tuple[PoorlySeenRegion, ...]:
     """Returns the largest regions, the largest first; `frames` are the names of support's views."""
     regions = sorted(_find_regions(cells), key=len, reverse=True)
-    return tuple(_describe_region(cells, region, support, frames) for region in regions[:MOST]
+    return tuple(_describe_region(cells, region, support, frames) for region in regions[:MOST_NAMED]
                  if len(region) >= _LEAST * len(cells.grid))
 
 
@@ -96,7 +97,7 @@ def _describe_region(
     places = (cells.grid[region] + 0.5) * cells.size
     middle = places[np.linalg.norm(places - places.mean(axis=0), axis=1).argmin()]
     few = bool(cells.few[region].sum() >= cells.narrow[region].sum())
-    several, wide = cells.views >= MIN_VIEWS, cells.span_deg >= MIN_SPAN_DEG
+    several, wide = cells.views >= MIN_OBSERVATIONS, cells.span_deg >= MIN_SPAN_DEG
     poor = np.isin(cells.cell, region) & (~several if few else several & ~wide)
     inside = torch.zeros_like(support.count, dtype=torch.bool)
     inside[cells.rows[torch.from_numpy(poor).to(cells.rows.device)]] = True

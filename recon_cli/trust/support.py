@@ -20,12 +20,12 @@ from torch import Tensor
 
 from recon_cli.errors import FormatError, Hint
 from recon_cli.render import render
+from recon_cli.render.contract import SHOWN_WEIGHT
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.train_view import TrainView
 from recon_cli.workspace.atomic import parse_json, replacing
 from recon_cli.workspace.paths import refuse_special
 
-CARRIES = 0.01  # of a pixel's colour, from which a view shows a Gaussian
 MAX_VIEWS = 300  # that are looked at, evenly spread; more show next to nothing new
 _VERSION = 1
 _BLUR = 3  # pixels across that a residual is read from: one alone is mostly noise
@@ -184,7 +184,7 @@ def measure_support(
             output = render(
                 splats, view.camera, splats.background, sh_degree, backend=backend, scores=True)
         statistics = output.statistics
-        rows = torch.nonzero(statistics.blend_max >= CARRIES)[:, 0]
+        rows = torch.nonzero(statistics.blend_max >= SHOWN_WEIGHT)[:, 0]
         shown.append(rows)
         if len(rows):
             error, counts = error_image(output.rgb.cpu().numpy(), view, gains=gains)

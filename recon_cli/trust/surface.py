@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.splats.ply import MIN_OPACITY
 from recon_cli.trust.support import ViewSupport
 from recon_cli.workspace.summaries import JsonRecord
 
-MIN_VIEWS = 3  # two views agree on much that is wrong
 MIN_SPAN_DEG = 10.0  # below, depth hangs on a fraction of a pixel
 # Median distances from the middle beyond which a surface is outside, as through a window. The
 # corner of an oblong room is two away.
@@ -25,7 +25,7 @@ CELL = 0.03  # median distances: some centimetres in a room
 class SurfaceShares(JsonRecord):
     """Shares of the surface that some training view shows; they add up to 1."""
 
-    well: float  # by MIN_VIEWS views or more that span MIN_SPAN_DEG or more
+    well: float  # by MIN_OBSERVATIONS views or more that span MIN_SPAN_DEG or more
     narrow: float  # by so many views, but from one direction
     few: float  # by fewer views
     cells: int  # of the surface
@@ -69,7 +69,7 @@ def find_cells(splats: Splats, support: ViewSupport) -> SurfaceCells:
     rows = surface_rows(splats, support)
     views = support.count[rows].cpu().numpy()
     span_deg = np.degrees(support.span(splats.means)[rows].cpu().numpy())
-    several, wide = views >= MIN_VIEWS, span_deg >= MIN_SPAN_DEG
+    several, wide = views >= MIN_OBSERVATIONS, span_deg >= MIN_SPAN_DEG
     means = splats.means[rows].detach().cpu().double().numpy()
     size = CELL * _distances(splats, rows)[1] if len(rows) else 1.0
     grid, cell = np.unique(np.floor(means / size).astype(np.int64), axis=0, return_inverse=True)

@@ -12,7 +12,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from recon_cli.errors import ReconError, WorkspaceError, causes
+from recon_cli.errors import MOST_CHARACTERS, ReconError, WorkspaceError, causes
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _WORDS = {
@@ -24,7 +24,6 @@ _WORDS = {
 _OUTSIDE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG, errno.EMFILE,
             errno.ENFILE, errno.ELOOP, errno.ENXIO, errno.ENODEV, errno.ESTALE)
 _PROBE_BYTES = 1 << 20
-_SHOWN = 200  # characters of a path
 _NO_TEMPORARY = "No usable temporary directory"  # of tempfile
 
 
@@ -76,7 +75,7 @@ def explain_outside(error: BaseException) -> ReconError | None:
     if not isinstance(error, OSError) or error.errno not in _OUTSIDE or error.filename is None:
         return None
     return WorkspaceError(
-        f"{os.fsdecode(error.filename)[:_SHOWN]} cannot be opened: {error.strerror}.",
+        f"{os.fsdecode(error.filename)[:MOST_CHARACTERS]} cannot be opened: {error.strerror}.",
         hint="Check its name, its permissions and its disk.")
 
 

@@ -9,9 +9,8 @@ import shlex
 import stat
 from pathlib import Path, PurePosixPath
 
-from recon_cli.errors import ConfigError, FormatError
+from recon_cli.errors import MOST_CHARACTERS, ConfigError, FormatError
 
-_SHOWN = 60  # characters of a name that is too long
 # A drive of Windows is one letter; a `Path` has but one of the two slashes.
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 _KINDS = {
@@ -54,7 +53,7 @@ def refuse_special(path: Path, *, command: str = "") -> None:
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             raise FormatError(
-                f"{str(path)[:_SHOWN]}... is longer than a path or a name in it can be.",
+                f"{str(path)[:MOST_CHARACTERS]}... is longer than a path or a name in it can be.",
                 hint="Give a shorter one.") from error
         return
     if kind:

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon_cli.capture.limits import MIN_MATCHES
 from recon_cli.capture.strangers import count_agreeing, find_features, find_strangers
+from recon_cli.scene.matches import MIN_PAIR_INLIERS
 
 
 def scene(seed, shift=0):
@@ -20,8 +20,8 @@ def scene(seed, shift=0):
     lambda gray: (0.5 * gray + 20).astype(np.uint8)])
 def test_views_of_one_scene_agree_and_those_of_two_do_not(change):
     first = find_features(scene(0))
-    assert count_agreeing(first, find_features(change(scene(0, shift=100)))) >= 2 * MIN_MATCHES
-    assert count_agreeing(first, find_features(change(scene(1)))) < MIN_MATCHES
+    assert count_agreeing(first, find_features(change(scene(0, shift=100)))) >= 2 * MIN_PAIR_INLIERS
+    assert count_agreeing(first, find_features(change(scene(1)))) < MIN_PAIR_INLIERS
 
 
 def test_plain_pictures_agree_with_none():

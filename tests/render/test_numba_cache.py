@@ -296,7 +296,7 @@ def test_while_another_process_compiles_its_progress_is_shown_and_nothing_runs(
         fresh_folder, tmp_path, monkeypatch):
     fresh_folder.setenv("RECON_CACHE_DIR", str(tmp_path))
     folder = kernel.cache_folder()
-    monkeypatch.setattr(backend, "_WAIT_SECONDS", 0.01)
+    monkeypatch.setattr(backend, "POLL_SECONDS", 0.01)
     ran, counted = [], threading.Semaphore(0)
     monkeypatch.setattr(backend, "_run_all", lambda: ran.append(folder))
     with backend._writing(folder):

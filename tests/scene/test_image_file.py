@@ -19,7 +19,7 @@ def images(count, shape=(30, 41, 3)):
 
 @pytest.mark.parametrize("segment", [1 << 20, 10_000, 100])
 def test_images_come_back_after_they_were_let_out_of_memory(tmp_path, monkeypatch, segment):
-    monkeypatch.setattr(image_file, "_SEGMENT", segment)
+    monkeypatch.setattr(image_file, "SEGMENT", segment)
     file, originals = ImageFile(tmp_path, window=5000), images(20)
     stored = [file.put(image) for image in originals]
     for _ in range(3):

@@ -100,7 +100,7 @@ def test_two_places_that_only_learned_features_confuse_are_refused():
 
 
 @pytest.mark.parametrize("few", [
-    {"sift": bridge.MIN_AGREEING - 1}, {"learned": bridge.MIN_INLIERS - 5}])
+    {"sift": bridge.MIN_AGREEING[0] - 1}, {"learned": bridge.MIN_POSE_INLIERS - 5}])
 def test_too_few_features_that_agree_are_no_bridge(few):
     pair = Pair(**few)
     assert find(pair.photo(0, (0, 0, 0)), pair.photo(12, (1, 0.1, 0.2))) is None

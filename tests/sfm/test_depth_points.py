@@ -5,7 +5,8 @@ import pytest
 from recon_cli.io.depth_maps import write_depth, write_depth_list
 from recon_cli.io.images import write_png
 from recon_cli.scene.camera import Lens
-from recon_cli.sfm.poses.depth_points import CELL, add_depth_points
+from recon_cli.scene.voxels import SURFACE_CELL
+from recon_cli.sfm.poses.depth_points import add_depth_points
 
 LENS = Lens("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 NAMES = tuple(f"{index}.png" for index in range(4))
@@ -54,7 +55,7 @@ def test_points_lie_on_the_wall_in_the_units_of_the_model_with_the_colour_of_the
     np.testing.assert_allclose(points[:, 2], WALL, atol=1e-3)  # 16 bits
     assert all(tuple(point.color) == COLOR for point in model.points3D.values())
     # one for each cell
-    cells = np.floor(points / (WALL * CELL)).astype(int)
+    cells = np.floor(points / (WALL * SURFACE_CELL)).astype(int)
     assert len(np.unique(cells, axis=0)) == count
 
 
@@ -103,7 +104,7 @@ def test_the_depth_of_held_out_frames_is_not_used(scene):
         add_depth_points(one, folder, folder / "frames", METRES, without=held_out)
         x[held_out] = placed(one)[:, 0].max()
     # the two on the right show .4 units more of the wall
-    assert x[()] - x[NAMES[2:]] == pytest.approx(0.4, abs=2 * WALL * CELL)
+    assert x[()] - x[NAMES[2:]] == pytest.approx(0.4, abs=2 * WALL * SURFACE_CELL)
 
 
 def test_without_depth_nothing_is_added(scene):

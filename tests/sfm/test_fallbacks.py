@@ -88,7 +88,7 @@ def test_a_video_begins_with_its_tracks_where_they_link_its_frames(capture):
 
 def test_a_long_video_is_matched_among_its_keyframes(capture, monkeypatch):
     job, _ = capture
-    monkeypatch.setattr(keyframes, "ALL", 3)
+    monkeypatch.setattr(keyframes, "FEW_FRAMES", 3)
     count = len(job.names)
     image = np.repeat(np.arange(count, dtype=np.int32), 100)
     Tracks(job.names, image, np.tile(np.arange(100, dtype=np.int32), count),

@@ -27,7 +27,7 @@ def test_a_short_video_has_keyframes_alone():
 
 @pytest.mark.parametrize(("life", "step"), [(10, 4), (5, 2), (2, 1), (200, keyframes.LONGEST)])
 def test_keyframes_follow_the_length_of_tracks(monkeypatch, life, step):
-    monkeypatch.setattr(keyframes, "ALL", 20)
+    monkeypatch.setattr(keyframes, "FEW_FRAMES", 20)
     rows = keyframes.choose_keyframes(steady(41, life))
     assert rows[0] == 0
     assert rows[-1] == 40

@@ -18,8 +18,7 @@ from recon_cli.splats.sog import Unpacked, load_sog, read_files, write_sog
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
-    monkeypatch.setattr(lod, "_COARSEST", 100)
-    monkeypatch.setattr(lod, "_LEAF", 150)
+    monkeypatch.setattr(lod, "_LEAF", 100)
     monkeypatch.setattr(lod, "_FILE", 400)
 
 

@@ -435,7 +435,7 @@ def test_many_frames_are_told_in_advance(
 ):
     take(video, tmp_path / "few")
     assert not any("frames are chosen" in notice for notice in notices())
-    monkeypatch.setattr(ingest, "MOST_UNSPLIT", 10)
+    monkeypatch.setattr(ingest, "FEW_FRAMES", 10)
     summary = take(video, tmp_path / "many")
     notice, = (notice for notice in notices() if "frames are chosen" in notice)
     assert_facts(notice, summary.frames, "for the way of the camera", "--max-frames")

@@ -102,7 +102,7 @@ def test_memory_that_is_short_lowers_the_cap_and_says_so(inputs, tmp_path, monke
 def test_images_in_a_file_change_no_byte(inputs, done, tmp_path, monkeypatch):
     first, summary = done
     monkeypatch.setattr(train_data, "_IN_MEMORY", 0.0)
-    monkeypatch.setattr(train_data, "_WINDOW", 3 * 48 * 36)
+    monkeypatch.setattr(train_data, "SEGMENT", 3 * 48 * 36)
     opened = []
 
     def opening(ctx):

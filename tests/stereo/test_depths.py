@@ -318,8 +318,8 @@ def by_plain_float64(inverse, image, confirmed, y, x):
     rows, columns = rows[inside], columns[inside]
     values, greys = inverse[rows + y, columns + x], image[rows + y, columns + x] - image[y, x]
     plane = np.array([inverse[y, x], 0.0, 0.0])
-    for turn in range(kernels._ROUNDS):
-        spread = STEP * (kernels._SPREAD if turn else kernels._FIRST_SPREAD)
+    for turn in range(len(kernels._SPREADS)):
+        spread = STEP * kernels._SPREADS[turn]
         off = values - plane @ [np.ones(len(rows)), columns, rows]
         off = (off / spread) ** 2 + (greys / kernels._GREY) ** 2
         weights = np.maximum(1 - off / kernels._CUT, 0) ** 4 * (values > 0)

@@ -17,6 +17,7 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
+from recon_cli.machine import POLL_SECONDS
 from recon_cli.render.contract import (
     RenderOutput, Statistics, StepOptions, TargetImage)
 from recon_cli.kernels.kernel import CODE, cache_folder, unsaved
@@ -30,7 +31,6 @@ from recon_cli.scene.splats import Splats
 
 KERNELS = 12  # that threads share; the progress counts these
 _SCIPY = "scipy.linalg"
-_WAIT_SECONDS = 0.25  # between looks at how far another process is
 _READY = "ready"  # file in the cache folder once every kernel is there
 
 
@@ -167,7 +167,7 @@ def _writing(folder: Path, on_wait: Callable[[], None] = lambda: None) -> Iterat
     lock = FileLock(folder.with_suffix(".lock"))
     while True:
         try:
-            lock.acquire(timeout=_WAIT_SECONDS)
+            lock.acquire(timeout=POLL_SECONDS)
             break
         except Timeout:
             on_wait()

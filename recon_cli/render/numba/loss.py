@@ -19,14 +19,14 @@ from recon_cli.kernels.simd import LANES
 from recon_cli.kernels.simd_functions import (
     absolute, broadcast, fetch_add, fill, fma, lane_numbers, load, load_bytes, select, store, total)
 from recon_cli.kernels.thread_pool import SCRATCH_FLOATS, pool
+from recon_cli.scene.train_view import BORDER, SSIM_C1, SSIM_C2, SSIM_SIGMA
 
-RADIUS = 5
 CHANNELS = 3
-_REACH = RADIUS * CHANNELS  # numbers to the outermost tap
+_REACH = BORDER * CHANNELS  # numbers to the outermost tap
 _ROWS = 4  # rows that are blurred together: each row of the images is read for all four
 _COLUMNS = 256  # numbers of a row that are blurred at a time: all stays in the first-level cache
 _WIDTH = LANES + _REACH + _COLUMNS + _REACH + LANES  # of a row of blurred numbers with its margins
-C1, C2 = np.float32(0.01**2), np.float32(0.03**2)  # for images in [0, 1]
+C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
 _STEP = np.float32(1 / 255)
 MAPS = 3
 MOMENTS = 4  # planes of a row in scratch
@@ -36,7 +36,7 @@ MIN_WIDTH = -(-LANES // CHANNELS)  # pixels; a row must fill one vector
 
 def taps() -> NDArray[np.float32]:
     """Returns the window, [11], of sum 1."""
-    window = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
+    window = np.exp(-0.5 * (np.arange(-BORDER, BORDER + 1) / SSIM_SIGMA) ** 2)
     normalised: NDArray[np.float32] = (window / window.sum()).astype(np.float32)
     return normalised
 
@@ -81,7 +81,7 @@ def blur_row(scratch, plane, column, window):
     """Returns one plane blurred along the row, LANES numbers from `column` of the block on."""
     at = plane * _WIDTH + LANES + column
     result = broadcast(window, _PAD) * load(scratch, at)
-    for k in range(1, 2 * RADIUS + 1):
+    for k in range(1, 2 * BORDER + 1):
         result = fma(broadcast(window, _PAD + k), load(scratch, at + CHANNELS * k), result)
     return result
 
@@ -110,10 +110,10 @@ def moments_down(image, truth, top, height, n, column, window, scratch, to):
     t0, t1, t2, t3 = x0, x0, x0, x0
     s0, s1, s2, s3 = x0, x0, x0, x0
     p0, p1, p2, p3 = x0, x0, x0, x0
-    for y in range(max(top - RADIUS, 0), min(top + _ROWS + RADIUS, height)):
+    for y in range(max(top - BORDER, 0), min(top + _ROWS + BORDER, height)):
         x, t = load(image, y * n + column), load_bytes(truth, y * n + column) * _STEP
         squares, product = fma(x, x, t * t), x * t
-        k = y - top + RADIUS + _PAD  # tap of the first row; one less for each row below
+        k = y - top + BORDER + _PAD  # tap of the first row; one less for each row below
         w0, w1 = broadcast(window, k), broadcast(window, k - 1)
         w2, w3 = broadcast(window, k - 2), broadcast(window, k - 3)
         x0, x1, x2, x3 = fma(w0, x, x0), fma(w1, x, x1), fma(w2, x, x2), fma(w3, x, x3)
@@ -132,9 +132,9 @@ def moments_down(image, truth, top, height, n, column, window, scratch, to):
 def map_down(maps, base, plane, top, height, n, column, window, scratch, to):
     """Blurs one map, from `base` on, down LANES columns, for the four rows from `top` on."""
     a, b, c, d = fill(0.0), fill(0.0), fill(0.0), fill(0.0)
-    for y in range(max(top - RADIUS, 0), min(top + _ROWS + RADIUS, height)):
+    for y in range(max(top - BORDER, 0), min(top + _ROWS + BORDER, height)):
         value = load(maps, base + y * n + column)
-        k = y - top + RADIUS + _PAD
+        k = y - top + BORDER + _PAD
         a, b = fma(broadcast(window, k), value, a), fma(broadcast(window, k - 1), value, b)
         c, d = fma(broadcast(window, k - 2), value, c), fma(broadcast(window, k - 3), value, d)
     keep_rows(scratch, plane, to, a, b, c, d)

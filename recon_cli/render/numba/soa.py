@@ -25,18 +25,14 @@ PATCH_WIDTH, PATCH_HEIGHT = 4, LANES // 4
 PATCHES_X, PATCHES_Y = TILE_WIDTH // PATCH_WIDTH, TILE_HEIGHT // PATCH_HEIGHT
 PATCHES = PATCHES_X * PATCHES_Y  # 32 whatever LANES is: a bit each
 
-RECORD = 16  # floats a Gaussian
-MEAN_X, MEAN_Y = 0, 1  # pixels
-U_X, U_Y, V_Y = 2, 3, 4
-LOG2_OPACITY = 5
-RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
-# The ellipse alpha = 1/255 in its bounding box, for culling: at an offset dx the ellipse covers
-# SLOPE_Y dx -+ HALF_Y sqrt(1 - (dx / EXTENT_X)^2). With x and y exchanged the slope is
-# b / c = -U_Y / U_X and the half EXTENT_Y V_Y / U_X.
-EXTENT_X, EXTENT_Y = 10, 11
-SLOPE_Y, HALF_Y = 12, 13  # b / a; pixels
-# What float32 drops of the mean: at 640 pixels it is 3e-5, and decides who reaches alpha = 1/255.
-MEAN_X_LOW, MEAN_Y_LOW = 14, 15
+# Floats of a Gaussian. Means are in pixels; the low part is what float32 drops: at 640 pixels
+# it is 3e-5, and decides who reaches alpha = 1/255. EXTENT, SLOPE and HALF are of the ellipse
+# alpha = 1/255 in its bounding box, for culling: at an offset dx it covers
+# SLOPE_Y dx -+ HALF_Y sqrt(1 - (dx / EXTENT_X)^2), where SLOPE_Y is b / a. With x and y exchanged
+# the slope is b / c = -U_Y / U_X and the half EXTENT_Y V_Y / U_X.
+RECORD = 16
+(MEAN_X, MEAN_Y, U_X, U_Y, V_Y, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, EXTENT_X, EXTENT_Y,
+ SLOPE_Y, HALF_Y, MEAN_X_LOW, MEAN_Y_LOW) = range(RECORD)
 
 FAR = 1e9  # pixels; half of an ellipse so large that only its box cuts
 BATCH = 64  # instances of a tile that are prepared at a time, a bit each

@@ -14,14 +14,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_SIGMA, _RADIUS = 1.5, 5
-_WINDOW = [math.exp(-0.5 * (shift / _SIGMA) ** 2) for shift in range(_RADIUS + 1)]
+from recon_cli.scene.train_view import BORDER, SSIM_C1, SSIM_C2, SSIM_SIGMA
+
+_WINDOW = [math.exp(-0.5 * (shift / SSIM_SIGMA) ** 2) for shift in range(BORDER + 1)]
 _TOTAL = _WINDOW[0] + 2 * sum(_WINDOW[1:])
 _BLOCK = 256  # numbers a program
 _PARTS = 1024  # sums that one program adds at once
-RADIUS = tl.constexpr(_RADIUS)
+RADIUS = tl.constexpr(BORDER)
 W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight / _TOTAL) for weight in _WINDOW)
-C1, C2 = tl.constexpr(0.01**2), tl.constexpr(0.03**2)  # for images in [0, 1]
+C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
 
 
 @triton.jit

@@ -36,7 +36,7 @@ _SUMMING_WARPS, _WARPS = 1, 4
 # Gaussians a program that walks along their instances: the one with the most keeps all waiting
 NARROW = 32
 _COEFFICIENTS = 256  # of sh_rest a program
-_LAST_KEY = (1 << 63) - 1  # sorts behind all others
+_LAST_KEY = torch.iinfo(torch.int64).max  # sorts behind all others
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.images import read_png
+from recon_cli.scene.matches import MAX_RATIO
+from recon_cli.scene.statistics import at_least
 from recon_cli.sfm import database
 from recon_cli.sfm.features import matching, xfeat_weights
 from recon_cli.sfm.features.features import DESCRIPTOR_SCALE
@@ -32,15 +34,22 @@ from recon_cli.sfm.features.xfeat import (
     find_learned_features,
 )
 from recon_cli.sfm.job import MappingJob, Reporter
-from recon_cli.sfm.limits import FEW_PAIR_MATCHES, MAX_TRIALS
+from recon_cli.sfm.limits import (
+    EXACT_PX,
+    FEW_PAIR_MATCHES,
+    MAX_TRIALS,
+    MIN_POSE_INLIERS,
+    NEAR_FRAMES,
+)
 from recon_cli.sfm.mapping import mapper, skeleton
 
 ATTEMPT = "bridge"
-# Of a bridge: inliers of XFeat, their share of its mutual matches, and pixels that one may be off
-# in an image of LONGER_SIDE. By these alone 46 of 67 pairs of a wall of lockers were false.
-MIN_INLIERS, MIN_INLIER_SHARE, MAX_OFF_PX = 30, 0.3, 2.0
-# SIFT's own matches that must lie on the geometry, and their share: 0 of 13 pairs are false so.
-MIN_AGREEING, MIN_AGREEING_SHARE = 6, 0.2
+# Of a bridge, besides MIN_POSE_INLIERS: the share of inliers in the mutual matches of XFeat, which
+# may be EXACT_PX off in an image of LONGER_SIDE. By these alone 46 of 67 pairs of a wall of lockers
+# were false.
+MIN_INLIER_SHARE = 0.3
+# SIFT's own matches that must lie on the geometry: at least, and of all. 0 of 13 pairs are false.
+MIN_AGREEING = (6, 0.2)
 MIN_COSINE = 0.82  # of two learned descriptors (paper)
 
 Rows = NDArray[np.int64]  # [M, 2] rows of keypoints in two images
@@ -73,7 +82,7 @@ def choose_pairs(
         apart = first not in part_of or part_of[first] != part_of.get(second)
         return apart or first in thin or second in thin
 
-    near = skeleton.near_pairs(job, skeleton.ALWAYS)
+    near = skeleton.near_pairs(job, NEAR_FRAMES)
     alike = matching.similar_pairs(job.database, job.names, seed=job.seed, besides=near)
     return {pair for pair in near | alike if helps(*pair) and (
         pair not in verified or len(verified[pair].inlier_matches) < FEW_PAIR_MATCHES)}
@@ -166,11 +175,11 @@ def find_bridge(
     start = [len(first.xy), len(second.xy)]
     learned = match_rows(first.learned.descriptors @ second.learned.descriptors.T,
                          least=MIN_COSINE * DESCRIPTOR_STEPS**2)
-    if len(learned) < MIN_INLIERS:
+    if len(learned) < MIN_POSE_INLIERS:
         return None
     options, camera = pycolmap.TwoViewGeometryOptions(), first.camera
     options.ransac.random_seed, options.ransac.max_num_trials = seed, MAX_TRIALS
-    options.ransac.max_error = MAX_OFF_PX * max(
+    options.ransac.max_error = EXACT_PX * max(
         1.0, max(camera.width, camera.height) / LONGER_SIDE)
     geometry = pycolmap.estimate_two_view_geometry(
         camera, np.concatenate([first.xy, first.learned.xy]),
@@ -178,13 +187,13 @@ def find_bridge(
         np.concatenate([known, learned + start]).astype(np.uint32), options)
     inliers = geometry.inlier_matches.astype(np.int64).reshape(-1, 2)
     new = inliers[inliers[:, 0] >= start[0]]
-    if geometry.F is None or len(new) < max(MIN_INLIERS, MIN_INLIER_SHARE * len(learned)):
+    if geometry.F is None or len(new) < max(MIN_POSE_INLIERS, MIN_INLIER_SHARE * len(learned)):
         return None
     similarity = first.sift @ second.sift.T
     own = match_sift(similarity)
     off = epipolar_distances(geometry.F, first.xy[own[:, 0]], second.xy[own[:, 1]])
     agreeing = np.count_nonzero(off < options.ransac.max_error)
-    if agreeing < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(own)):
+    if agreeing < at_least(MIN_AGREEING, len(own)):
         return None
     similarity[~near_epipolar_lines(
         geometry.F, first.xy, second.xy, options.ransac.max_error)] = -1
@@ -198,7 +207,7 @@ def find_bridge(
 def match_sift(similarity: NDArray[np.float32]) -> Rows:
     """Returns the mutual nearest neighbours by products [N, M] of SIFT descriptors (COLMAP)."""
     return match_rows(similarity, least=float(np.cos(matching.MAX_ANGLE)) * DESCRIPTOR_SCALE**2,
-                      ratio=matching.MAX_RATIO)
+                      ratio=MAX_RATIO)
 
 
 def match_rows(

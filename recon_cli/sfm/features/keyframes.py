@@ -13,11 +13,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from recon_cli.io.tracks import Tracks
+from recon_cli.scene.statistics import at_least
 from recon_cli.sfm.features.matching import Pair
+from recon_cli.sfm.limits import FEW_FRAMES
 
-ALL = 200  # frames up to which all are keyframes
-# Tracks that a keyframe shares with the next one: of its own, and at least. No step is longer.
-SHARED, LEAST_SHARED, LONGEST = 0.5, 60, 6
+SHARED = (60, 0.5)  # tracks that a keyframe shares with the next one: at least, and of its own
+LONGEST = 6  # frames from one to the next
 # Tracks from which on two frames are worth matching: of 774 pairs with fewer, five to ten keyframes
 # apart, 58 were verified, of 285 with more, 122.
 FEW_TRACKS = 5
@@ -26,13 +27,13 @@ FEW_TRACKS = 5
 def choose_keyframes(tracks: Tracks) -> tuple[int, ...]:
     """Returns the rows of the keyframes of a video in order; the first and the last are two."""
     count = len(tracks.names)
-    if count <= ALL:
+    if count <= FEW_FRAMES:
         return tuple(range(count))
     seen = np.bincount(tracks.image, minlength=count)
     rows = [0]
     while rows[-1] < count - 1:
         last = rows[-1]
-        enough = max(LEAST_SHARED, SHARED * seen[last])
+        enough = at_least(SHARED, seen[last])
         step = 1
         while (step < LONGEST and last + step < count - 1
                and len(tracks.matches(last, last + step + 1)[0]) >= enough):

@@ -19,16 +19,13 @@ from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, Hint, list_names
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.scene.matches import MAX_RATIO, MIN_PAIR_INLIERS
+from recon_cli.scene.statistics import FINE_SAMPLE
 from recon_cli.sfm import database
 from recon_cli.sfm.database import scales
 from recon_cli.sfm.features.features import DESCRIPTOR_SCALE
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
-from recon_cli.sfm.limits import (
-    MAX_TRIALS,
-    MIN_DEEP_SHARE,
-    MIN_PAIR_INLIERS,
-    MIN_PANORAMA_SHARE,
-)
+from recon_cli.sfm.limits import COARSEST_KEYPOINTS, MAX_TRIALS, MIN_DEEP_SHARE, MIN_PANORAMA_SHARE
 from recon_cli.sfm.mapping import checks
 from recon_cli.sfm.results import MatchesResult
 
@@ -39,17 +36,11 @@ SEQUENTIAL_OVERLAP = 10
 # with 50 or more verified matches in a slow walk, 67% in a room, 80% in 50 photos.
 NEAREST = 20
 WORDS = 64  # 32, or all keypoints in place of the coarsest 1000, chose no better pairs
-DESCRIBED = 1000  # keypoints of an image, largest scale first: they are seen from more places
-WORD_SAMPLE = 20_000  # descriptors that k-means runs on
 WORD_ROUNDS = 10  # of k-means
-# Exhaustive matching grows with the square: 4950 pairs take a minute on two cores at 600x340.
-EXHAUSTIVE_MAX = 100
-# Descriptors compared with others at a time, and pairs of images whose descriptors are read at a
-# time: they bound the memory.
-CHUNK, PAIRS_AT_ONCE = 1024, 1000
-# Of two descriptors that match: the largest angle (radians), and that angle over the one to the
-# second nearest. COLMAP's (SiftMatchingOptions).
-MAX_ANGLE, MAX_RATIO = 0.7, 0.8
+# Descriptors compared with others, and pairs of images whose descriptors are read, at a time: they
+# bound the memory.
+CHUNK = 1024
+MAX_ANGLE = 0.7  # radians, of two descriptors that match. COLMAP's (SiftMatchingOptions)
 
 Pair = tuple[str, str]  # file names in order
 Matches = NDArray[np.uint32]  # [M, 2] rows of the keypoints in either image
@@ -152,7 +143,7 @@ def _features(database: Path, names: Sequence[str]) -> list[NDArray[np.float32]]
         for name in names:
             rows = np.asarray(opened.read_descriptors(ids[name]).data, np.float32)
             largest = np.argsort(-scales(opened.read_keypoints(ids[name])), kind="stable")
-            rows = rows.reshape(-1, 128)[largest[:DESCRIBED]]
+            rows = rows.reshape(-1, 128)[largest[:COARSEST_KEYPOINTS]]
             features.append(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
     return features
 
@@ -162,7 +153,7 @@ def _visual_words(
 ) -> NDArray[np.float32]:
     """Returns the centres that k-means finds, [W, 128]."""
     descriptors = np.concatenate(features)
-    sample = descriptors[generator.permutation(len(descriptors))[:WORD_SAMPLE]]
+    sample = descriptors[generator.permutation(len(descriptors))[:FINE_SAMPLE]]
     words = sample[:WORDS].copy()
     for _ in range(WORD_ROUNDS):
         nearest = _nearest(sample, words)
@@ -292,8 +283,8 @@ def _write_geometries(
     images = {image.name: image for image in opened.read_all_images()}
     cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
     with ThreadPoolExecutor(job.threads) as pool:
-        for start in range(0, len(pairs), PAIRS_AT_ONCE):
-            some = pairs[start:start + PAIRS_AT_ONCE]
+        for start in range(0, len(pairs), CHUNK):
+            some = pairs[start:start + CHUNK]
             numbers = {name: images[name].image_id for name in itertools.chain(*some)}
             places = {name: opened.read_keypoints(number)[:, :2].astype(np.float64)
                       for name, number in numbers.items()}

@@ -17,6 +17,7 @@ from recon_cli.sfm.limits import (
     MAX_ERROR_PX,
     MAX_TRIALS,
     MIN_PAIR_EXPLAINED,
+    NEAR_FRAMES,
 )
 from recon_cli.sfm.model_arrays import ModelArrays
 from recon_cli.sfm.verdict.evidence import (
@@ -25,8 +26,6 @@ from recon_cli.sfm.verdict.evidence import (
     lift_rays,
     nearest_depth,
 )
-
-NEAR_FRAMES = 3  # frames; a loop is closed by more than one pair of near frames
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm.limits import MIN_TRACK_LENGTH
+from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.sfm.model_arrays import ModelArrays
 
 # Of the image's longer side: the diagonal of the box around all spots where a point was found.
@@ -29,5 +29,5 @@ def find_still_share(model: pycolmap.Reconstruction) -> float:
     spread = np.linalg.norm(
         np.maximum.reduceat(sorted_spots, starts) - np.minimum.reduceat(sorted_spots, starts),
         axis=1)
-    still = spread[counts >= MIN_TRACK_LENGTH] < MAX_SPREAD
+    still = spread[counts >= MIN_OBSERVATIONS] < MAX_SPREAD
     return float(still.mean()) if len(still) else 0.0

@@ -10,7 +10,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 from recon_cli.errors import SfmError, list_names, name_command
-from recon_cli.sfm.limits import MAX_FLAT_SHARE, MIN_FRAMES, MIN_PAIR_INLIERS, MIN_PARALLAX_DEG
+from recon_cli.scene.matches import MIN_PAIR_INLIERS
+from recon_cli.sfm.limits import MAX_FLAT_SHARE, MIN_FRAMES, MIN_PARALLAX_DEG
 
 _MOVE = (
     "Record again while walking: move the camera sideways around the room instead of turning on "

@@ -19,16 +19,11 @@ from dataclasses import dataclass
 
 from recon_cli.errors import SfmError, name_command
 from recon_cli.io.colmap_library import pycolmap, write_model
+from recon_cli.scene.matches import EXHAUSTIVE_MAX, MIN_PAIR_INLIERS
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching, xfeat_weights
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
-from recon_cli.sfm.limits import (
-    ENOUGH_FRAMES,
-    FEW_PAIR_MATCHES,
-    MIN_FRAMES,
-    MIN_ONE_POINT,
-    MIN_PAIR_INLIERS,
-)
+from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, MIN_FRAMES, MIN_ONE_POINT
 from recon_cli.sfm.mapping import checks, mapper, merge_models, parts, skeleton, wide_lens
 from recon_cli.sfm.mapping.merge_models import ModelCandidate
 from recon_cli.sfm.mapping.trusted_part import cuts_models, deliver_parts
@@ -104,7 +99,7 @@ def list_fallbacks(job: MappingJob) -> tuple[Fallback, ...]:
         return (_incremental(job.pairs, "--pairs asks for it"),)
     relaxed = Fallback("relaxed", "", lambda *_: set(), mapper.map_relaxed)
     every = _incremental("exhaustive", f"{count} frames are few enough to match all pairs")
-    ways: tuple[Fallback, ...] = (every, relaxed) if count <= matching.EXHAUSTIVE_MAX else (
+    ways: tuple[Fallback, ...] = (every, relaxed) if count <= EXHAUSTIVE_MAX else (
         _incremental("retrieval", f"{count} frames are too many to match all pairs at once"),
         relaxed, every)  # lower thresholds take less time than all pairs
     if len(skeleton.list_keyframes(job)) < count:  # all pairs of so many would take an hour

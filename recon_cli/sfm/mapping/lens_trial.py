@@ -16,23 +16,24 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm.limits import MAX_ERROR_PX, MIN_TRACK_LENGTH
+from recon_cli.scene.statistics import LEAST_SAMPLE, MIN_OBSERVATIONS, OUTLIER_SIGMAS
+from recon_cli.sfm.limits import MAX_ERROR_PX
 from recon_cli.sfm.mapping import mapper
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.workspace.json_record import JsonRecord
 
 # The models that are tried. FULL_OPENCV gained .3% at most over the better of the last two.
 MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
-# Share of the error that another model must take away to be preferred, and by how many standard
-# errors. Of 20 captures by ordinary cameras OPENCV lost .9% at most against any other, but for one
+# Share of the error that another model must take away to be preferred, beside OUTLIER_SIGMAS of it.
+# Of 20 captures by ordinary cameras OPENCV lost .9% at most against any other, but for one
 # walk straight ahead, in which RADIAL was 2.5% better.
-CLEARLY, SIGMAS = 0.05, 3.0
+CLEARLY = 0.05
 # From which share on a model cannot be trusted. OPENCV lost 41% on a fisheye of 155 degrees, whose
 # cameras were 9 cm off in a room, and 18% on one of 104 degrees, with 1.8 cm. SIMPLE_RADIAL, which
 # only those get who ask for it, lost 6% at most in the 20 captures.
 WRONG = 0.10
 LEAST_PX = 0.02  # that it must take away: features are not found more exactly
-LEAST_POINTS, LEAST_IMAGES = 100, 5  # that are judged; fewer decide nothing
+LEAST_IMAGES = 5  # that are judged; fewer decide nothing
 MOST_IMAGES = 40  # of a camera; they show a lens as well as all
 _GRID = 15  # pixels a side, by which a camera is put into another model
 _EVALUATIONS = 60  # of that fit
@@ -77,7 +78,7 @@ def find_better_lenses(
     part = _middle(model)
     own = {number: part.camera(number) for number in sorted(cameras)
            if number in part.cameras}
-    if not own or len(_left_out(part)) < LEAST_POINTS:
+    if not own or len(_left_out(part)) < LEAST_SAMPLE:
         return ()
     names = dict.fromkeys([*(camera.model_name for camera in own.values()), *MODELS])
     errors = {name: try_lens(part, own, name) for name in names}
@@ -89,7 +90,7 @@ def find_better_lenses(
         better = min(names, key=lambda name: float(errors[name][number].mean()))
         gain, noise = gain_over(errors[better][number], ours)
         error, less = root(ours), root(errors[better][number])
-        if gain > max(CLEARLY, SIGMAS * noise) and error - less > LEAST_PX:
+        if gain > max(CLEARLY, OUTLIER_SIGMAS * noise) and error - less > LEAST_PX:
             found.append(BetterLens(number, camera.model_name, better, error, less, gain, noise))
     return tuple(found)
 
@@ -159,7 +160,7 @@ def _middle(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def _left_out(model: pycolmap.Reconstruction) -> list[int]:
     """Returns the points that are left out: every second one of those that enough images see."""
     return [number for number, point in sorted(model.points3D.items())
-            if point.track.length() >= MIN_TRACK_LENGTH][::2]
+            if point.track.length() >= MIN_OBSERVATIONS][::2]
 
 
 def _fit(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap, write_model
+from recon_cli.scene.statistics import OUTLIER_SIGMAS
 from recon_cli.sfm import database
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import (
@@ -27,9 +28,6 @@ from recon_cli.sfm.limits import (
 THREADS = 1
 # Growth after which all is adjusted again: 16.2 s on the sample, 20.0 s with COLMAP's 1.1.
 GLOBAL_RATIO = 1.2
-# Times the mean error, above which an observation does not count; see LOSS_SCALE. Half and twice
-# as much change the error of the cameras by .02 cm.
-SHARP_RATIO = 3.0
 # Relative change of the cost that ends an adjustment; a hundredth takes three times as long and
 # moves those cameras by less than .001 cm.
 TOLERANCE = 1e-4
@@ -213,7 +211,9 @@ def sharpen(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """
     error = model.compute_mean_reprojection_error()
     sharp = pycolmap.Reconstruction(model)
-    pycolmap.ObservationManager(sharp).filter_all_points3D(SHARP_RATIO * error, MIN_RAY_ANGLE_DEG)
+    # half and twice as much change the error of the cameras by .02 cm; see LOSS_SCALE
+    pycolmap.ObservationManager(sharp).filter_all_points3D(
+        OUTLIER_SIGMAS * error, MIN_RAY_ANGLE_DEG)
     if any(sharp.image(i).num_points3D < KEPT_SHARE * model.image(i).num_points3D
            for i in model.reg_image_ids()):
         sharp = pycolmap.Reconstruction(model)

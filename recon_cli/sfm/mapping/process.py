@@ -19,10 +19,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from recon_cli.errors import ExitCode, ReconError, SfmError, format_count, name_command
+from recon_cli.machine import POLL_SECONDS
 from recon_cli.processes import start_module
 from recon_cli.progress import Bar, Progress
 from recon_cli.sfm import database
-from recon_cli.sfm.job import LOCK, POLL_SECONDS, Event, MappingJob, Phase, PlaceJob, parse
+from recon_cli.sfm.job import LOCK, Event, MappingJob, Phase, PlaceJob, parse
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.disk import refuse_full_disk
 from recon_cli.workspace.steps import StepFolder, make_way

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.tracks import Tracks
+from recon_cli.scene.matches import EXHAUSTIVE_MAX, MIN_PAIR_INLIERS
 from recon_cli.sfm import database
 from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.keyframes import (
@@ -40,7 +41,7 @@ from recon_cli.sfm.features.keyframes import (
 from recon_cli.sfm.features.matching import Pair, similar_pairs
 from recon_cli.sfm.features.pair_checks import check_pairs, list_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
-from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, MIN_PAIR_INLIERS
+from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, NEAR_FRAMES
 from recon_cli.sfm.mapping import mapper, merge_models
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.segments.loop_closure import optimize_model
@@ -66,7 +67,6 @@ OVERLAPPING_PHOTOS = 12
 # Pairs per image that look alike. Of some 240 on the videos of the two rooms 97% overlap by the
 # skeleton, of 314 on a walk round a room 27%; without those the rooms' cameras are as exact.
 SIMILAR = 5
-ALWAYS = 3  # neighbours that are matched in any case
 # Keypoints of a photo, the coarsest, from which cameras are found first. Of the 1225 pairs of 50
 # photos 914 are verified with 1000, 743 with 600 and 566 with 400, in 17, 10 and 4 CPU s.
 COARSEST = 600
@@ -174,7 +174,7 @@ def choose_tracked_pairs(job: MappingJob, report: Reporter) -> set[Pair]:
     models = load_skeleton(job, report)
     tracks = _read_tracks(job)
     names = name_keyframes(tracks)
-    near = near_pairs(job, ALWAYS, names)
+    near = near_pairs(job, NEAR_FRAMES, names)
     if len(models) > 1:
         further = near_pairs(job, matching.SEQUENTIAL_OVERLAP, names)
         whole = len(names) == len(job.names)
@@ -209,7 +209,7 @@ def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Re
     coarse = replace(job, matches_db=folder / MATCHES_DB)
     copy_coarsest(job.database, coarse.database)
     pairs = matching.exhaustive_pairs(job.names)
-    if len(job.names) > matching.EXHAUSTIVE_MAX:
+    if len(job.names) > EXHAUSTIVE_MAX:
         pairs = matching.near_or_similar_pairs(job, job.names)
     matching.match_pairs(coarse, pairs, report, phase="coarse")
     report.phase("first", len(job.names))

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.scene.matches import MIN_PAIR_INLIERS
 from recon_cli.sfm import database
 from recon_cli.sfm.features import matching
 from recon_cli.sfm.job import DATABASE, CameraGroup, MappingJob, Reporter
-from recon_cli.sfm.limits import MIN_PAIR_INLIERS
+from recon_cli.sfm.limits import EXACT_PX
 from recon_cli.sfm.mapping import mapper
 
 # The fallbacks, which have databases of their own: for fisheyes, and for what errors of points show
@@ -37,8 +38,7 @@ ORDINARY_FOCALS = (0.5, 0.72, 1.04)
 CLEARLY = 1.03
 _PAIRS = 16  # of the most matches, that the lenses are tried on
 _LEAST_MATCHES = 500  # in those pairs; fewer decide nothing
-_FEW_TRIALS, _MOST_TRIALS = 50, 300  # of RANSAC
-_EXACT_PX = 2.0  # by which a match may miss its epipolar line
+_TRIALS = (50, 300)  # of RANSAC, least and most
 
 Sample = tuple[NDArray[np.float64], NDArray[np.float64]]  # pixels [M, 2] of matches in two images
 
@@ -139,8 +139,8 @@ def count_explained(camera: pycolmap.Camera, sample: Sample, *, seed: int) -> in
     """Returns how many matches between two images of a camera one motion explains."""
     options = pycolmap.RANSACOptions()
     options.random_seed = seed
-    options.min_num_trials, options.max_num_trials = _FEW_TRIALS, _MOST_TRIALS
-    options.max_error = _EXACT_PX
+    options.min_num_trials, options.max_num_trials = _TRIALS
+    options.max_error = EXACT_PX
     found = pycolmap.estimate_essential_matrix(*sample, camera, camera, options)
     return 0 if found is None else int(found["num_inliers"])
 

@@ -22,16 +22,11 @@ from recon_cli.io.depth_maps import (
     read_sure_depth,
 )
 from recon_cli.io.images import read_png
+from recon_cli.scene.statistics import LEAST_WITNESSES, MOST_MAPS
+from recon_cli.scene.voxels import SURFACE_CELL, number_cells
 from recon_cli.sfm.model_arrays import registered_images
 
-MOST_MAPS = 100  # evenly spread
 SAMPLES = 8000  # of each map
-# Side of the cells that get one point each, in median depths: 10 cm in a room, as of the points of
-# dense stereo. Half as much puts so many Gaussians on bare walls that the rest lacks them: .4 and
-# .5 dB less in two rooms, with the same surfaces.
-CELL = 1 / 25
-AGREE = 2  # frames that show a surface in a cell
-_HALF = 1 << 20  # cells on each side of the origin
 
 
 def add_depth_points(
@@ -54,9 +49,9 @@ def add_depth_points(
         return 0
     points, colors, depths = (np.concatenate(part) for part in zip(*clouds, strict=True))
     owner = np.repeat(np.arange(len(clouds)), [len(part[0]) for part in clouds])
-    side = CELL * float(np.median(depths))
+    side = SURFACE_CELL * float(np.median(depths))
     known = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    rows = _choose(points, owner, side, known, agree=min(AGREE, len(clouds)))
+    rows = _choose(points, owner, side, known, agree=min(LEAST_WITNESSES, len(clouds)))
     for row in rows:
         model.add_point3D(points[row], pycolmap.Track(), colors[row])
     return len(rows)
@@ -85,16 +80,10 @@ def _choose(
     known: NDArray[np.float64], *, agree: int,
 ) -> NDArray[np.intp]:
     """Returns the rows of one point for each cell that enough maps show and no known point."""
-    cells = _number(points, side)
+    cells = number_cells(points, side)
     pairs = np.unique(np.column_stack([cells, owner]), axis=0)
     shown, maps = np.unique(pairs[:, 0], return_counts=True)
     good = shown[maps >= agree]
-    good = good[~np.isin(good, _number(known, side))]
+    good = good[~np.isin(good, number_cells(known, side))]
     first, rows = np.unique(cells, return_index=True)
     return np.sort(rows[np.isin(first, good)])
-
-
-def _number(points: NDArray[np.float64], side: float) -> NDArray[np.int64]:
-    """Returns the number of the cell of each point, [P]."""
-    at = np.clip(np.floor(points / side), -_HALF, _HALF - 1).astype(np.int64) + _HALF
-    return np.asarray((at[:, 0] << 42) | (at[:, 1] << 21) | at[:, 2])

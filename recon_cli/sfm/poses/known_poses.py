@@ -22,7 +22,12 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm import database
 from recon_cli.sfm.features import features, matching
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
-from recon_cli.sfm.limits import MIN_CONFIRMED, MIN_SPOT_AGREEING, MIN_SPOT_MATCHES
+from recon_cli.sfm.limits import (
+    COARSEST_KEYPOINTS,
+    MIN_CONFIRMED,
+    MIN_PAIR_EXPLAINED,
+    MIN_SPOT_MATCHES,
+)
 from recon_cli.sfm.mapping import checks, fallbacks, mapper, parts
 from recon_cli.sfm.mapping.merge_models import build_posed_model
 from recon_cli.sfm.model_arrays import viewmat_of
@@ -39,7 +44,6 @@ MAX_AXES_DEG = 75.0
 PLACES = 4  # of the spot check, spread over the images by name
 # Of the cameras nearest to each place: the next one, and one with a baseline that tells more.
 NEIGHBOURS = (0, 5)
-FEATURES = 1000  # keypoints an image
 
 Poses = NDArray[np.float64]  # [F, 4, 4] world to camera
 
@@ -71,7 +75,7 @@ def match_known(job: MappingJob, report: Reporter) -> MatchesResult:
             tracked_poses.match_overlapping(job, rest, report)
             found = matching.count_matches(job)
         elif job.pose_use == "refine":
-            raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
+            raise _misfit(check.share or 0.0, MIN_PAIR_EXPLAINED)
         else:
             found = fallbacks.match_first(job, report)
         return replace(found, poses_share=check.share, poses_contradicted=check.contradicted)
@@ -117,7 +121,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
     matched = StepFolder(job.out).find("matches", MatchesResult)
     assert matched is not None, "matches come before the model"
     share = matched.poses_share
-    if share is None or share >= MIN_SPOT_AGREEING:
+    if share is None or share >= MIN_PAIR_EXPLAINED:
         checks.check_registered(job.names, list(known.viewmats), 0.0)
         report.phase("mapping", len(job.names))
         try:
@@ -129,7 +133,7 @@ def build_known_model(job: MappingJob, report: Reporter) -> ModelResult:
         matching_again = fallbacks.list_fallbacks(job)[0].choose_pairs(job, report)
         matching.match_pairs(job, matching_again, report)
     else:
-        reason = _misfit(share, MIN_SPOT_AGREEING).message
+        reason = _misfit(share, MIN_PAIR_EXPLAINED).message
     found = fallbacks.build_model(job, report)
     return replace(
         found, notes=(f"{reason} The cameras were found from the pictures alone.", *found.notes),
@@ -183,7 +187,7 @@ def _check_some(job: MappingJob, known: KnownPoses) -> SpotCheck:
     """Returns how well sampled images agree with the poses; SfmError if they do not."""
     check = spot_check(job, known.viewmats)
     if not check.fits:
-        raise _misfit(check.share or 0.0, MIN_SPOT_AGREEING)
+        raise _misfit(check.share or 0.0, MIN_PAIR_EXPLAINED)
     return check
 
 
@@ -303,7 +307,7 @@ class SpotCheck:
     @property
     def fits(self) -> bool:
         """Whether the poses can be used."""
-        return self.share is None or self.share >= MIN_SPOT_AGREEING
+        return self.share is None or self.share >= MIN_PAIR_EXPLAINED
 
     def describe(self) -> str:
         """Returns a sentence for the terminal."""
@@ -328,7 +332,8 @@ def spot_check(
         replace(group, names=chosen) for group in job.groups
         if (chosen := tuple(name for name in group.names if name in sampled)))
     sample = replace(
-        job, out=fresh_folder(job.attempts / "check"), groups=groups, max_features=FEATURES)
+        job, out=fresh_folder(job.attempts / "check"), groups=groups,
+        max_features=COARSEST_KEYPOINTS)
     silent = Reporter(io.BytesIO())
     matching.create_database(sample)
     try:

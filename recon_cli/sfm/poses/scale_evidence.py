@@ -23,7 +23,9 @@ from recon_cli.io.depth_maps import (
     read_depth_list,
     read_sure_depth,
 )
-from recon_cli.room.scale_fusion import ScaleSource
+from recon_cli.room.scale_fusion import GIVEN_ERROR, ScaleSource
+from recon_cli.scene.gravity import MAX_UP_SPREAD_DEG
+from recon_cli.scene.statistics import robust_sigma
 from recon_cli.sfm.job import PlaceJob
 from recon_cli.sfm.model_arrays import ModelArrays, registered_images
 from recon_cli.workspace.records import read_poses
@@ -34,18 +36,15 @@ TRACKED, DEPTH = "the tracked poses", "sensor depth"  # sources
 # Frames apart, of the motions that are compared: the drift of near frames is small, and of far
 # ones the noise. The distance with the smallest error is taken.
 LAGS = (1, 2, 4, 8, 16)
-FEWEST_BLOCKS, MOST_BLOCKS = 5, 12  # parts of a walk, one of which is left out at a time
-FEWEST_FRAMES = 10  # fewer fit any motion
-# Relative errors that all motions, or all depths, of a capture have in common, so that they cannot
-# show in it: assumed, as of phones 0.3 to 1% are reported.
-TRACKED_ERROR, DEPTH_ERROR = 0.003, 0.005
+BLOCKS = (5, 12)  # least and most parts of a walk, one of which is left out at a time
+FEWEST_FRAMES = 2 * BLOCKS[0]  # fewer fit any motion
+DEPTH_ERROR = 0.005  # as GIVEN_ERROR, of depths
 # Poses of another capture: turns from frame to frame differ by more than this (degrees, and as a
 # share), or lengths by more than this share, in the median.
 MAX_TURN_DEG, MAX_TURN_SHARE, MAX_LENGTH_SHARE = 2.0, 0.1, 0.2
 MOST_DEPTH_MAPS = 40  # evenly spread
 _UNFIT = ("Sensor depth gives neither scale nor points: few points of the model have some, or it "
           "differs from them.")
-MAX_UP_SPREAD_DEG = 5.0  # median angle of up, by single frames, to the mean of all
 
 
 @dataclass(frozen=True)
@@ -102,9 +101,9 @@ def scale_from_poses(found: Viewmats, tracked: Viewmats) -> ScaleSource | None:
     if not _same_motion(ours, theirs):
         return None
     estimates = [_compare_lengths(ours, theirs, lag) for lag in LAGS
-                 if lag == 1 or len(names) >= 2 * FEWEST_BLOCKS * lag]
+                 if lag == 1 or len(names) >= FEWEST_FRAMES * lag]
     scale, error = min(estimates, key=lambda estimate: estimate[1])
-    return ScaleSource(TRACKED, scale, float(np.hypot(error, TRACKED_ERROR)))
+    return ScaleSource(TRACKED, scale, float(np.hypot(error, GIVEN_ERROR)))
 
 
 def _same_motion(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
@@ -148,7 +147,7 @@ def _compare_lengths(
         scale = float((weights * one * other).sum() / max((weights * one**2).sum(), 1e-12))
         off = np.abs(other - scale * one)
         weights = 1 / (1 + (off / max(3 * float(np.median(off)), 1e-12))**2)
-    blocks = np.clip(len(one) // (2 * lag), FEWEST_BLOCKS, MOST_BLOCKS)
+    blocks = np.clip(len(one) // (2 * lag), *BLOCKS)
     above, below = weights * one * other, weights * one**2
     ratios = np.array([
         (above.sum() - above[rows].sum()) / max(below.sum() - below[rows].sum(), 1e-12)
@@ -206,13 +205,13 @@ def scale_from_depth(model: pycolmap.Reconstruction, ingest: Path) -> ScaleSourc
         if known.sum() >= LEAST_POINTS:
             every.append(theirs[known] / ours[rows][known])
             ratios.append(float(np.median(every[-1])))
-    if len(ratios) < FEWEST_BLOCKS:
+    if len(ratios) < BLOCKS[0]:
         return None
     scale = float(np.median(ratios))
-    noise = 1.4826 * float(np.median(np.abs(np.concatenate(every) / scale - 1)))
+    noise = robust_sigma(np.concatenate(every) / scale - 1)
     if noise > MOST_NOISE:
         return None
-    spread = 1.4826 * float(np.median(np.abs(np.array(ratios) / scale - 1)))
+    spread = robust_sigma(np.array(ratios) / scale - 1)
     # of a median: 1.25 times that of a mean
     error = 1.25 * spread / np.sqrt(len(ratios))
     return ScaleSource(DEPTH, scale, float(np.hypot(error, DEPTH_ERROR)))

@@ -25,8 +25,8 @@ from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.limits import (
     LOOP_CANDIDATES,
     MAX_ERROR_PX,
+    MIN_PAIR_EXPLAINED,
     MIN_POSE_INLIERS,
-    MIN_SPOT_AGREEING,
     MIN_SPOT_MATCHES,
 )
 from recon_cli.sfm.mapping import mapper
@@ -52,7 +52,7 @@ STEPS = (1, 2)
 ROUNDS_DEG = (1.5, 0.0)
 # Standard deviation of a tracked position before it is measured, and the least one, as shares of
 # the size of the path.
-FIRST_DEVIATION, LEAST_DEVIATION = 0.02, 0.001
+DEVIATIONS = (0.02, 0.001)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class PosesCheck:
     @property
     def fits(self) -> bool:
         """Whether the poses may be a start."""
-        return self.share is None or self.share >= MIN_SPOT_AGREEING
+        return self.share is None or self.share >= MIN_PAIR_EXPLAINED
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ def match_near(job: MappingJob, viewmats: Viewmats, report: Reporter) -> PosesCh
     share = agreeing.total() / matches.total() if total >= MIN_SPOT_MATCHES else None
     return PosesCheck(total, share, tuple(
         name for name in sorted(matches) if matches[name] >= MIN_SPOT_MATCHES
-        and agreeing[name] < MIN_SPOT_AGREEING * matches[name]))
+        and agreeing[name] < MIN_PAIR_EXPLAINED * matches[name]))
 
 
 def match_overlapping(
@@ -139,7 +139,7 @@ def adjust_tracked(
     model, cache = _posed(job, viewmats), _cache(job)
     priors = {name: _center(viewmat) for name, viewmat in viewmats.items()}
     size = float(np.linalg.norm(np.ptp(np.array(list(priors.values())), axis=0))) or 1.0
-    deviation, before = FIRST_DEVIATION * size, 0.0
+    deviation, before = DEVIATIONS[0] * size, 0.0
     for number, angle in enumerate(ROUNDS_DEG):
         off = _widest(model, angle)
         if number:
@@ -153,7 +153,7 @@ def adjust_tracked(
                           if count < MIN_POSE_INLIERS})
         adjust_with_priors(
             model, priors, deviation, constant=constant, seed=job.seed, max_error=off)
-        deviation = max(measure_deviation(model, priors), LEAST_DEVIATION * size)
+        deviation = max(measure_deviation(model, priors), DEVIATIONS[1] * size)
         if set(job.names) - set(viewmats):
             mapper.resect(job, model)
     placed = set(mapper.list_registered(model))

@@ -26,7 +26,7 @@ from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.keyframes import choose_keyframes, name_keyframes
 from recon_cli.sfm.features.pair_checks import check_pairs, list_views
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
-from recon_cli.sfm.limits import LOOP_CANDIDATES, MAX_RESIDUAL
+from recon_cli.sfm.limits import LOOP_CANDIDATES, MAX_RESIDUAL, NEAR_FRAMES
 from recon_cli.sfm.mapping import mapper, merge_models, skeleton
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.results import MatchesResult, SplitResult
@@ -127,7 +127,7 @@ def match_segments(job: MappingJob, report: Reporter) -> MatchesResult:
     """Matches frames of different segments that look alike, besides what segments have matched."""
     collect_matches(job)
     known = _inner_pairs(job.segments)
-    near, names = skeleton.near_pairs(job, skeleton.ALWAYS), job.names
+    near, names = skeleton.near_pairs(job, NEAR_FRAMES), job.names
     if job.tracks is not None:  # segments have matched what lies near each other
         near, names = near - known, name_keyframes(Tracks.read(job.tracks))
     pairs = near | matching.similar_pairs(

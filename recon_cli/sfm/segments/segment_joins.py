@@ -17,7 +17,9 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 from scipy.spatial.transform import Rotation
 
+from recon_cli.scene.matches import MIN_PAIR_INLIERS
 from recon_cli.scene.similarity import Similarity
+from recon_cli.scene.statistics import COARSE_SAMPLE
 from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.limits import (
     MAX_DRIFT,
@@ -26,13 +28,11 @@ from recon_cli.sfm.limits import (
     MAX_RESIDUAL,
     MIN_COMMON_SHARE,
     MIN_LOOP_SHARE,
-    MIN_PAIR_INLIERS,
     MIN_POSE_INLIERS,
     NEAR_IN_WALK,
 )
 from recon_cli.sfm.segments.shared_points import SegmentCameras, SharedPoints, estimate_similarity
 
-MOST_POINTS = 4000  # of two segments that a similarity is found from
 # Nine of ten cameras of common frames: of the extent of the smaller segment, and degrees. A median
 # would not see that the others are off.
 CAMERAS, MAX_OFF, MAX_TURN_DEG = 0.9, 0.05, 3.0
@@ -105,7 +105,7 @@ def _similarity(
     Points of common frames decide where there are enough: others may only look alike.
     """
     rows = np.flatnonzero(common if np.count_nonzero(common) >= MIN_POSE_INLIERS else common | True)
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), COARSE_SAMPLE)).astype(int)]
     agreed = estimate_similarity(
         shared.ours[rows], shared.theirs[rows], max_error=MAX_POINT_ERROR * depth, seed=seed)
     return None if agreed is None else agreed.motion

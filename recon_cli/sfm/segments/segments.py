@@ -31,6 +31,7 @@ from recon_cli.jobs.shared_jobs import JobEnd, SharedJob, run_jobs
 from recon_cli.progress import NullProgress, Progress, limit_rate
 from recon_cli.sfm.features.keyframes import choose_keyframes
 from recon_cli.sfm.job import SPLIT, MappingJob
+from recon_cli.sfm.limits import FEW_FRAMES, MIN_STRETCH
 from recon_cli.sfm.mapping.process import CrashError, run_job
 from recon_cli.sfm.results import SplitResult, StepResult
 from recon_cli.workspace.atomic import read_json, write_json
@@ -39,11 +40,9 @@ from recon_cli.workspace.steps import StepFolder
 
 Names = tuple[str, ...]
 
-MOST_UNSPLIT = 200  # frames up to which a capture is mapped as one
 # Frames of a segment, and those that it has in common with the next one. Shorter segments spend
 # more on what they share, longer ones are fewer jobs.
 LENGTH, SEGMENT_OVERLAP = 150, 25
-LEAST_FRAMES = 10  # frames of a segment
 TRIES = 2  # of a mapping process that is killed, perhaps for want of memory beside others
 COMMAND = "map-segment"  # of recon, which takes JOB
 # in the folder of a segment: what to do, how much of it is done, and what the command printed
@@ -64,11 +63,11 @@ def count_segments(frames: int, asked: str) -> int:
         return 1
     if asked == "auto":
         step = LENGTH - SEGMENT_OVERLAP
-        return 1 if frames <= MOST_UNSPLIT else -(-(frames - SEGMENT_OVERLAP) // step)
-    most = max(1, frames // LEAST_FRAMES)
+        return 1 if frames <= FEW_FRAMES else -(-(frames - SEGMENT_OVERLAP) // step)
+    most = max(1, frames // MIN_STRETCH)
     if int(asked) > most:
         raise ConfigError(
-            f"{frames} frames are too few for {asked} segments of at least {LEAST_FRAMES} frames.",
+            f"{frames} frames are too few for {asked} segments of at least {MIN_STRETCH} frames.",
             hint=f"Give at most --segments {most}.")
     return int(asked)
 

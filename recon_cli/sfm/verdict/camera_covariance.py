@@ -16,9 +16,10 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.errors import list_names
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.sphere import is_panorama
-from recon_cli.sfm.limits import MIN_FRAMES
+from recon_cli.sfm.limits import MIN_FRAMES, MIN_POSE_INLIERS
 from recon_cli.sfm.mapping.prior_adjustment import LEAST_ERROR_PX
 from recon_cli.sfm.verdict.evidence import MatchEvidence
 from recon_cli.sfm.verdict.scale_drift import (
@@ -36,10 +37,6 @@ MAX_CAMERA_ERROR, MAX_MODEL_ERROR = 0.02, 0.03
 # independent ones: three quarters of the cameras of living and fox were off by up to 5.3 times what
 # these would leave, and of office by up to 6.2 (`tests/bench/bench_thinned.py`).
 SHARED_ERRORS = 5.0
-# COLMAP itself asks for so many to place a camera, if thresholds are not relaxed. Fewer may agree
-# by chance, which no covariance shows: one with 22 points was off by a tenth of the extent.
-MIN_CAMERA_POINTS = 30
-MOST_NAMED = 5
 MOST_CAMERAS = 300  # of more it takes longer than seconds
 Errors = Mapping[str, float]  # by the name of an image, as a share of the extent
 
@@ -73,7 +70,7 @@ def estimate_camera_errors(model: pycolmap.Reconstruction, names: Sequence[str])
 def list_rough(errors: Errors, points: Mapping[str, int]) -> tuple[str, ...]:
     """Returns the cameras that are known badly: by their errors, or as they see too few points."""
     return tuple(sorted(name for name, error in errors.items()
-                        if error > MAX_CAMERA_ERROR or points[name] < MIN_CAMERA_POINTS))
+                        if error > MAX_CAMERA_ERROR or points[name] < MIN_POSE_INLIERS))
 
 
 def list_loose(errors: Errors, evidence: MatchEvidence) -> Iterator[OutlierCamera]:
@@ -86,7 +83,7 @@ def list_loose(errors: Errors, evidence: MatchEvidence) -> Iterator[OutlierCamer
         matches = int(evidence.matches[own].sum())
         share = float(evidence.explained[own].sum()) / max(matches, 1)
         if (name in errors and share < MIN_SURE_EXPLAINED
-                and evidence.points[row] < MIN_CAMERA_POINTS):
+                and evidence.points[row] < MIN_POSE_INLIERS):
             yield OutlierCamera(name, share, matches, "", None)
 
 
@@ -94,10 +91,9 @@ def describe_rough(errors: Errors, rough: Sequence[str]) -> Iterator[str]:
     """Yields a sentence on the cameras that are rough, if any are."""
     if rough:
         yield (f"{len(rough)} of {len(errors)} cameras are rough, known to no better than "
-               f"{MAX_CAMERA_ERROR:.0%} of the extent of all or by fewer than {MIN_CAMERA_POINTS} "
-               f"points: {', '.join(f'{name} ({errors[name]:.1%})' for name in rough[:MOST_NAMED])}"
-               f"{' and others' if len(rough) > MOST_NAMED else ''}. Photos between them and the "
-               "others would tell more.")
+               f"{MAX_CAMERA_ERROR:.0%} of the extent of all or by fewer than {MIN_POSE_INLIERS} "
+               f"points: {list_names([f'{name} ({errors[name]:.1%})' for name in rough])}. Photos "
+               "between them and the others would tell more.")
 
 
 def describe_inexact(errors: Errors) -> Iterator[str]:

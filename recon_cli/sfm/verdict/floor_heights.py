@@ -16,6 +16,7 @@ from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.gravity import find_gravity
 from recon_cli.scene.surfaces import find_floor
 from recon_cli.sfm.features.sphere import is_panorama
+from recon_cli.sfm.limits import MIN_STRETCH
 from recon_cli.sfm.model_arrays import ModelArrays
 
 LOOKED_AT = 20  # images that are looked at together, and half of them further on again
@@ -23,8 +24,7 @@ CONE_DEG = 8.0  # between the floor's normal and what is up for all cameras
 # Between the down axis of a panorama and the mean of all, in the median: those of a tripod or of a
 # camera that levels them agree by .55 degrees in an empty flat.
 LEVEL_DEG = 2.0
-# Images on either side of a cut in a walk whose heights are compared, and how many must know them.
-COMPARED, LEAST_HEIGHTS = 60, 10
+COMPARED = 60  # images on either side of a cut in a walk whose heights are compared
 # Steps of the log of that height on good walks, as a standard deviation: .02 to .07 on eight, .05
 # by their squares. One larger than the other is to another surface, such as a table.
 SPREAD, MAX_LOG_STEP = 0.05, 0.4
@@ -76,7 +76,7 @@ def compare_heights(heights: NDArray[np.float64], place: int) -> float | None:
     None where too few of them know their height, or the surfaces are not the same.
     """
     return compare_sides(heights[max(0, place - COMPARED):place], heights[place:place + COMPARED],
-                         LEAST_HEIGHTS)
+                         MIN_STRETCH)
 
 
 def compare_sides(

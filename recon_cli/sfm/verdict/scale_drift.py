@@ -22,8 +22,9 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from recon_cli.errors import format_count
 from recon_cli.io.colmap_library import pycolmap
+from recon_cli.scene.statistics import ROUNDING
 from recon_cli.sfm.features.sphere import is_panorama, radian_px, ray_frames, unit_rays
-from recon_cli.sfm.limits import LOSS_SCALE, MIN_FRAMES
+from recon_cli.sfm.limits import LOSS_SCALE, MIN_FRAMES, MIN_STRETCH
 from recon_cli.sfm.model_arrays import ModelArrays
 from recon_cli.sfm.verdict import view_graph
 from recon_cli.sfm.verdict.evidence import MatchEvidence
@@ -36,9 +37,9 @@ from recon_cli.sfm.verdict.floor_heights import (
 from recon_cli.workspace.json_record import JsonRecord
 
 # The scale of a stretch of a walk is that of its cameras' centres. It spans this share of the
-# extent of all and of the usual depth, and so many cameras: on a shorter one the camera stands
+# extent of all and of the usual depth, and MIN_STRETCH cameras: on a shorter one the camera stands
 # still, or turns. Errors of a side of a graph that spans less count in proportion.
-LEAST_EXTENT, LEAST_DEPTHS, LEAST_CAMERAS = 0.2, 0.5, 10
+LEAST_EXTENT, LEAST_DEPTHS = 0.2, 0.5
 # Errors of tracks and of the lens are shared by many observations and do not average out: scales
 # were off by up to 20 times what independent errors would leave on a walk with a cheap lens, and by
 # about as much as that in rendered rooms.
@@ -53,7 +54,6 @@ MIN_SURE_EXPLAINED = 0.85
 MAX_FLOOR_STEP = (MAX_SCALE_ERROR + 0.1) / 2
 # Cameras that lie nearer to each other than this share of a reach are at one place: centres have a
 # precision of some 1e-12 of it, and what is known of a scale is divided by the distance.
-COINCIDENT = 1e-6
 DOUBTFUL = MAX_SCALE_ERROR / 3  # the floor is looked at from here on
 _RIDGE = 1e-10  # times the diagonal: position, turn and scale of the model are free
 POSE = 6  # unknowns of a camera: its turn, and its centre
@@ -171,7 +171,7 @@ def _graph_cuts(information: _Information, shared: view_graph.Weights) -> Iterat
             len(ours), len(theirs)))
         both = np.append(ours, theirs[other])
         share = information.reached(both, theirs)
-        if share < COINCIDENT:  # the same photo twice: no scale, and rounding errors in its place
+        if share < ROUNDING:  # the same photo twice: no scale, and rounding errors in its place
             continue
         yield _Cut(min(1.0, share) * information.error(theirs, both), side, (ours, theirs),
                    (int(ours[end]), int(theirs[other])))
@@ -260,12 +260,12 @@ class _Information:
     def stretch(self, rows: Rows, others: Rows) -> Rows | None:
         """Returns as many of the cameras, from the first on, as show the scale of a stretch.
 
-        None where all of them span too little, or they are fewer than LEAST_CAMERAS.
+        None where all of them span too little, or they are fewer than MIN_STRETCH.
         """
         spans = self._spans(rows)
         for reach in (self._reach, self._reach * self._shrinkage(rows, others)):
-            if len(rows) >= LEAST_CAMERAS and spans[-1] >= reach:
-                return rows[:max(int(np.argmax(spans >= reach)) + 1, LEAST_CAMERAS)]
+            if len(rows) >= MIN_STRETCH and spans[-1] >= reach:
+                return rows[:max(int(np.argmax(spans >= reach)) + 1, MIN_STRETCH)]
         return None
 
     def _spans(self, rows: Rows) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.errors import SfmError, format_count, list_names, name_command
+from recon_cli.errors import MOST_NAMED, SfmError, format_count, list_names, name_command
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.sphere import is_panorama
 from recon_cli.sfm.features.still_points import MAX_STILL, find_still_share
@@ -41,12 +41,11 @@ from recon_cli.workspace.json_record import KEY, JsonRecord
 # measured: 1.1 to 2.8 in good models, 9 to 20 where cameras are displaced.
 MAX_STEP = 6.0
 WINDOW = 15  # steps; a median over fewer follows the jump itself
-MIN_STEPS = 5  # fewer say nothing about what is usual
+MIN_STEPS = WINDOW // 3  # fewer say nothing about what is usual
 # Longer steps cannot be a cut in a video: displaced cameras gave 9 to 20, a walk's end at rest 6.
 MAX_LEAP = 100.0
 # Share of the median sharpness below which an image is called blurred, as in IngestConfig.
 BLURRED = 0.5
-MOST_LINES = 5  # for images without a camera; all of them are in the verdict
 BINS = 10
 # Shift of the principal point as a share of the longer side. Measured: 0 to 0.03 in sound models of
 # ten and more frames. Where it was held in the middle instead, cameras moved by 1% of the extent at
@@ -129,9 +128,9 @@ class ModelVerdict(JsonRecord):
             f"Step {jump.ratio:.0f} times as long as usual: {jump.before} to {jump.after}."
             for jump in self.jumps]
         missing = list(self.unregistered.items())
-        lines += [f"{name} has no camera: {reason}." for name, reason in missing[:MOST_LINES]]
-        if len(missing) > MOST_LINES:
-            more = len(missing) - MOST_LINES
+        lines += [f"{name} has no camera: {reason}." for name, reason in missing[:MOST_NAMED]]
+        if len(missing) > MOST_NAMED:
+            more = len(missing) - MOST_NAMED
             lines.append(f"{more} more {'has' if more == 1 else 'have'} no camera.")
         return lines
 

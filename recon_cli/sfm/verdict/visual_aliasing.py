@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.faces import panorama_pixels
 from recon_cli.sfm.features.sphere import is_panorama
+from recon_cli.sfm.limits import MAX_OUTLIERS
 from recon_cli.sfm.model_arrays import registered_images
 from recon_cli.sfm.verdict import view_graph
 from recon_cli.sfm.verdict.evidence import MatchEvidence
@@ -43,12 +44,10 @@ MIN_CELLS = 100  # between two groups of images: a handful of pairs
 # much. See `tests/bench/bench_verdict.py`.
 MIN_OVERLAP = 0.56
 # Cells are told apart by the angle between the rays of the two images, in degrees.
-BANDS_DEG = (2.5, 5.0, 7.5)
+BANDS_DEG = MAX_ANGLE_DEG * np.arange(1, 4) / 4
 # A smaller share found within the groups is taken for this one: then they are wrong themselves.
 MIN_RATE = 0.6
 MARGIN = 0.03  # of the image at each side, where neighbourhoods of features are cut off
-# A smaller share of the cameras is not half of a doubled place: blurred images match badly too.
-MIN_SIDE = 0.1
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,8 @@ def find_aliasing(evidence: MatchEvidence, overlap: Overlap) -> VisualAliasing:
     total, found = expected.sum(axis=0), confirmed.sum(axis=0)
     cut, share = None, np.inf
     head = np.arange(1, len(rows))
-    even = np.minimum(head, len(rows) - head) > MIN_SIDE * len(rows)  # enough images on both sides
+    # enough images on both sides
+    even = np.minimum(head, len(rows) - head) > MAX_OUTLIERS * len(rows)
     for order in (
         *view_graph.disagreement_orders(found, total), *view_graph.loose_orders(total),
         *view_graph.loose_orders(evidence.shared[inner].astype(np.float64)),

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.sfm.limits import MIN_EXPLAINED, MIN_ONE_POINT, MIN_PAIR_INLIERS, MIN_POSE_INLIERS
+from recon_cli.scene.matches import MIN_PAIR_INLIERS
+from recon_cli.sfm.limits import MAX_OUTLIERS, MIN_EXPLAINED, MIN_ONE_POINT, MIN_POSE_INLIERS
 from recon_cli.sfm.verdict import view_graph
 from recon_cli.sfm.verdict.evidence import MatchEvidence
 from recon_cli.sfm.verdict.view_graph import Cut, Weights
@@ -33,8 +34,6 @@ STRONGEST = 5
 WRONG = 0.75
 # Images that stand at most so many apart in their order are next to each other.
 REACH = 2
-# Sides of up to this share of the cameras are outliers, which can be dropped.
-MAX_OUTLIERS = 0.1
 
 
 @dataclass(frozen=True)

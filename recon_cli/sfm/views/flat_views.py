@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.faces import Face, grid_faces, nearest_face, pixel_rays
+from recon_cli.scene.train_view import BORDER
 from recon_cli.sfm.features.face_images import PICTURES, cube_warps, cut_face
 from recon_cli.sfm.features.sphere import is_panorama, unit_rays
 
@@ -25,9 +26,8 @@ from recon_cli.sfm.features.sphere import is_panorama, unit_rays
 MOST_LOST = 0.1
 # Of a mask, where less of a face is left, as of the floor below a tripod, there is no view.
 LEAST_COUNTING = 0.05
-# Degrees from the axis of a face to its side at most; and pixels of a face around its own part of
-# the frame, twice what the window of SSIM reaches.
-MOST_ASIDE_DEG, MARGIN = 50.0, 10
+MOST_ASIDE_DEG = 50.0  # from the axis of a face to its side
+MARGIN = 2 * BORDER  # pixels of a face around its own part of the frame
 MOST_FACES = 9
 _SAMPLES = 96  # pixels of a frame, along each side, by which faces are laid out
 # A ray that does not come back to its pixel lies where the lens model is not one to one, radians;

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from recon_cli.errors import TrainingError
 from recon_cli.render.torch.projection import rotation_matrices
-from recon_cli.scene.splats import Splats, joined
+from recon_cli.scene.splats import MOST_OPACITY, Splats, joined
 from recon_cli.train.fit.state import DensificationStats, TrainState
 from recon_cli.train.fit.task import Task
 
@@ -36,7 +36,7 @@ _OFFSET = 0.5
 _LONG = 0.5
 _SHORT = 0.85
 _OPACITY = 0.6
-_RANGE = 1e-4, 0.999  # of a child's opacity: the logit stays finite
+_FAINTEST = 1e-4  # opacity of a child
 
 @dataclass(frozen=True)
 class DensifyRule:
@@ -173,7 +173,8 @@ def _axis_halves(parent: Splats) -> Splats:
     shrink.scatter_(1, axis, math.log(_LONG))
     child = parent.map(torch.clone)
     child.log_scales = parent.log_scales + shrink
-    child.logit_opacities = torch.logit((_OPACITY * parent.opacities).clamp(*_RANGE))
+    opacities = (_OPACITY * parent.opacities).clamp(_FAINTEST, MOST_OPACITY)
+    child.logit_opacities = torch.logit(opacities)
     sides = [replace(child, means=child.means + side * offset) for side in (-1, 1)]
     return joined(sides)[0]
 

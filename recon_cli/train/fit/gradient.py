@@ -18,16 +18,12 @@ from recon_cli.render import Statistics, render
 from recon_cli.render.contract import StepOptions, TargetDepth, TargetImage
 from recon_cli.render.depth_loss import depth_loss
 from recon_cli.render.response import Response, ResponseGradient, ResponseTensors
-from recon_cli.scene.train_view import TrainView
+from recon_cli.scene.train_view import BORDER, SSIM_C1, SSIM_C2, SSIM_SIGMA, TrainView
 from recon_cli.train.fit.optimizer import SplatOptimizer
 
 if TYPE_CHECKING:
     from recon_cli.render.triton.step_status import StepReport, StepStatus
 
-# of SSIM in the loss, as in the reference: 11 taps
-_SIGMA = 1.5
-_RADIUS = 5
-_C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
 # Relative, of a rendered depth: it is a mean of those of the centres of Gaussians, which lie before
 # and behind the surface. Without it, sensors of 1% cost .3 to .9 dB (two rooms).
 RENDERED_NOISE = 0.05
@@ -217,8 +213,8 @@ def photometric_loss(
 
 def _taps() -> list[float]:
     """Returns the right half of the normalised window, the centre first."""
-    window = torch.exp(-0.5 * (torch.arange(-_RADIUS, _RADIUS + 1.0).double() / _SIGMA) ** 2)
-    half: list[float] = (window / window.sum())[_RADIUS:].tolist()
+    window = torch.exp(-0.5 * (torch.arange(-BORDER, BORDER + 1.0).double() / SSIM_SIGMA) ** 2)
+    half: list[float] = (window / window.sum())[BORDER:].tolist()
     return half
 
 
@@ -228,7 +224,7 @@ def blur(images: Tensor) -> Tensor:
     for axis in (-1, -2):
         length = images.shape[axis]
         out = images * taps[0]
-        for shift in range(1, min(_RADIUS, length - 1) + 1):
+        for shift in range(1, min(BORDER, length - 1) + 1):
             rest = length - shift
             out.narrow(axis, 0, rest).add_(images.narrow(axis, shift, rest), alpha=taps[shift])
             out.narrow(axis, shift, rest).add_(images.narrow(axis, 0, rest), alpha=taps[shift])
@@ -243,9 +239,9 @@ class _Ssim(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, truth: Tensor) -> Tensor:
         x, y = (item.permute(2, 0, 1).contiguous() for item in (image, truth))
         mu_x, mu_y, xx, yy, xy = blur(torch.stack([x, y, x * x, y * y, x * y]))
-        a1, a2 = 2 * mu_x * mu_y + _C1, 2 * (xy - mu_x * mu_y) + _C2
-        b1 = mu_x * mu_x + mu_y * mu_y + _C1
-        b2 = (xx - mu_x * mu_x) + (yy - mu_y * mu_y) + _C2
+        a1, a2 = 2 * mu_x * mu_y + SSIM_C1, 2 * (xy - mu_x * mu_y) + SSIM_C2
+        b1 = mu_x * mu_x + mu_y * mu_y + SSIM_C1
+        b2 = (xx - mu_x * mu_x) + (yy - mu_y * mu_y) + SSIM_C2
         ssim = a1 * a2 / (b1 * b2)
         ctx.save_for_backward(x, y, mu_x, mu_y, a1, a2, b1, b2, ssim)
         mean: Tensor = ssim.mean()

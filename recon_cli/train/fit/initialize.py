@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from recon_cli.config.stages import MIN_GAUSSIANS
 from recon_cli.errors import TrainingError, format_count, name_command
 from recon_cli.scene.backdrop import Backdrop
 from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined
@@ -20,7 +21,7 @@ from recon_cli.train.parts.photometry import Photometry
 from recon_cli.train.parts.table import PARTS
 
 _OPACITY = 0.1  # initial opacity of the reference implementation
-_NEIGHBOURS = 3
+_NEIGHBOURS = MIN_GAUSSIANS - 1
 _MIN_SCALE = 1e-7  # world units; coincident points would otherwise start at scale 0
 
 

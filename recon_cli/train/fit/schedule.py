@@ -85,7 +85,6 @@ BUDGET = Recipe(
 RECIPES = {"reference": REFERENCE, "budget": BUDGET}
 
 
-_RESET_EVERY = 3000
 _RESET_FLOOR = 1000  # steps; after a reset at a rate of .05 a picture needs some hundred to return
 # Steps that the falling rates must have: fewer settle nothing, and only cost what the fall takes.
 # Forty steps at 96 pixels end at 14.3 dB without a fall, at 13.9 with one over the last eight.
@@ -127,8 +126,8 @@ class Schedule:
 
     @property
     def reset_every(self) -> int:
-        """Steps from one opacity reset to the next."""
-        return max(_RESET_FLOOR, round(_RESET_EVERY * self.length / STEPS))
+        """Steps from one opacity reset to the next: 3,000 of the 30,000 of the reference."""
+        return max(_RESET_FLOOR, round(self.length / 10))
 
     @property
     def mid(self) -> int:

@@ -20,6 +20,7 @@ from recon_cli.errors import TrainingError, name_command
 from recon_cli.render import Statistics
 from recon_cli.render.contract import StepOptions
 from recon_cli.render.response import ResponseGradient
+from recon_cli.scene.statistics import at_least
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit.densification import STRATEGIES, Strategy
 from recon_cli.train.fit.gradient import DeferredStep, gradient_step
@@ -29,8 +30,7 @@ from recon_cli.train.fit.state import DensificationStats, TrainState
 from recon_cli.train.fit.task import Task
 from recon_cli.train.parts.table import step_options
 
-_SKIPPED = 0.02  # share of the run's steps that may come to nothing
-_SKIPPED_FLOOR = 5
+_SKIPPED = (5, 0.02)  # steps that may come to nothing: at least, and of the run's
 _FARTHEST = 100  # steps between two meetings, so that Ctrl-C and a progress bar need not wait
 
 
@@ -263,7 +263,7 @@ def next_view(state: TrainState, task: Task) -> int:
 def skip(state: TrainState, task: Task, steps: int = 1) -> None:
     """Counts steps whose loss is not finite; raises TrainingError where there were too many."""
     state.skipped += steps
-    most = max(_SKIPPED_FLOOR, int(_SKIPPED * task.schedule.config.iterations))
+    most = int(at_least(_SKIPPED, task.schedule.config.iterations))
     if state.skipped > most:
         raise TrainingError(
             f"The loss is not finite at step {state.iteration}, as at {state.skipped - 1} steps "

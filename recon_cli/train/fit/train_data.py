@@ -27,7 +27,7 @@ from recon_cli.io.colmap import read_visibility
 from recon_cli.io.images import fit_camera
 from recon_cli.machine import free_memory_bytes
 from recon_cli.render.contract import NEAR
-from recon_cli.scene.image_file import ImageFile
+from recon_cli.scene.image_file import SEGMENT, ImageFile
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import TERMS
 from recon_cli.scene.train_view import TrainView
@@ -39,8 +39,7 @@ from recon_cli.workspace.atomic import read_json, write_bytes
 logger = logging.getLogger("recon")
 
 # Memory is counted from what the code allocates and rounded up; `recon bench` measures a step.
-_FLOATS = 14  # of a Gaussian, its higher SH coefficients apart
-_LARGEST = 4  # numbers of the largest parameter, these apart: a quaternion
+_FLOATS = (3, 4, 3, 1, 3)  # of a Gaussian: mean, quaternion, scales, opacity, colour
 # values, gradients and two moments, and a copy of the values while densification rebuilds them
 _COPIES = 4 + 1
 _BUFFERS_PER_GAUSSIAN = 128 + 6 * 72  # a record, indices and the gradient sums of about six tiles
@@ -48,7 +47,6 @@ _BUFFERS_PER_PIXEL = 96  # image, its gradient, three maps of the loss, transmit
 _PROGRAM = 350 << 20  # Python, torch and the kernels
 _REDUCED = 1.25  # of the images: full ones and those of half the size
 _IN_MEMORY = 0.5  # of the memory; images that take more lie in a file
-_WINDOW = 256 << 20  # bytes of that file that are in memory at once
 _TORCH_FACTOR = 4  # autograd keeps what the fused kernels compute again
 
 
@@ -113,7 +111,7 @@ def image_file(ctx: StageContext) -> ImageFile:
     """Returns a file for images that would take too much memory."""
     if ctx.scratch is not None:
         ctx.scratch.mkdir(parents=True, exist_ok=True)
-    return ImageFile(ctx.scratch, _WINDOW)
+    return ImageFile(ctx.scratch, SEGMENT)
 
 
 def write_config(folder: Path, config: RunConfig) -> None:
@@ -175,10 +173,10 @@ def estimate_memory(
     images = int(_REDUCED * pixels * (3 * views + masks))
     in_file = free is not None and images > _IN_MEMORY * free
     if in_file:
-        images = min(images, _WINDOW + int(_REDUCED * pixels * masks))
+        images = min(images, SEGMENT + int(_REDUCED * pixels * masks))
     rest = 3 * TERMS[sh_degree]
     # and of one moment of one parameter at a time
-    per_gaussian = 4 * (_COPIES * (_FLOATS + rest) + max(_LARGEST, rest))
+    per_gaussian = 4 * (_COPIES * (sum(_FLOATS) + rest) + max(*_FLOATS, rest))
     factor = 1 if fused else _TORCH_FACTOR
     return MemoryEstimate(
         images=images, pixel_buffers=factor * pixels * _BUFFERS_PER_PIXEL,

@@ -21,23 +21,20 @@ from recon_cli.io.images import reduce_to
 from recon_cli.scene.backdrop import fibonacci_sphere
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, TERMS, Splats
+from recon_cli.scene.statistics import LEAST_WITNESSES
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit.task import Evidence
 from recon_cli.train.parts.decisions import Rule
-from recon_cli.train.parts.part import Part, Sign, Start, TrialScene
+from recon_cli.train.parts.part import SEARCH_SIDE, Part, Sign, Start, TrialScene
 
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
 _DIRECTIONS = 5000  # on the whole sphere: 3 degrees apart
 _VIEWS = 50  # looked at, at most
-# pixels of the longer side of an image in the search, whatever the size that is trained at: in
-# smaller ones the points around a window would close it
-_SEARCH_SIDE = 150
 # a surface covers this many times the median distance of its points in the image around each,
 # within these reduced pixels: between dense points a window stays open, sparse ones close a wall
 _COVER = 3.0
 _COVER_RANGE = 1, 4
 _SAMPLES = 500  # points that this median is taken over
-_AGREE = 2  # views that must see nothing in front
 _SHARE = 0.1  # of the views that look there: elsewhere a surface lacks points in some views only
 _FACING = 5  # directions that must be free in a view that sees some of it; 50 square degrees
 # Of views that look at one thing: the median sine of the angle between axis and point is .03 to .13
@@ -47,11 +44,11 @@ _MISSED, _BEFORE, _SIDES_DEG = 0.25, 0.9, 10.0
 _FILL_DEGREES = 12.0  # directions this close to a far one become far: frames and trees hide some
 # Of gaps between points, in the reduced images. Set beforehand, and held against views in the
 # middle of stretches that were taken away (tests/bench/notes/training.md); .1 gained as much.
-_GAP_GRID = 4  # pixels from one place that is looked at to the next
+_GAP_GRID = _COVER_RANGE[1]  # pixels from one place that is looked at to the next
 _NEIGHBOURS = 12  # points whose median depth a gap has
 _GAP_CELL = 0.06  # of the median depth of all gaps: places within are one
 _THROUGH = 1.15  # times the depth of a gap: a point beyond it, this many pixels away or less, shows
-_THROUGH_RANGE = 2  # that the gap is seen through
+_THROUGH_RANGE = _GAP_GRID / 2  # that the gap is seen through
 _THROUGH_SHARE = 0.2  # of the views that look there; the points of some lie behind what hides them
 _OPACITY = 0.5
 _SPACING = 0.6  # of the distance between directions: the standard deviation
@@ -90,7 +87,7 @@ def find_background(
         free = shown.free[line, column]
         empty[rows[free]] += 1
         total[rows[free]] += small.image[line[free], column[free]] / 255
-    far = (empty >= _AGREE) & (empty >= _SHARE * looked_at)
+    far = (empty >= LEAST_WITNESSES) & (empty >= _SHARE * looked_at)
     share = float(far.sum() / max(1, (looked_at > 0).sum()))
     colors = total / np.maximum(empty, 1)[:, None]
     far, colors = _fill_gaps(directions, far, colors)
@@ -111,7 +108,7 @@ class _SearchView:
 
 def _search_view(view: TrainView, points: NDArray[np.float64]) -> _SearchView:
     """Returns the points that a view shows."""
-    small = reduce_to(view, _SEARCH_SIDE)
+    small = reduce_to(view, SEARCH_SIDE)
     free = ~_cover_mask(small, points)
     if small.mask is not None:
         free &= small.mask
@@ -148,7 +145,7 @@ def _find_gaps(searched: Sequence[_SearchView]) -> tuple[NDArray[np.float64], ND
     places, colors = (
         np.stack([np.bincount(cell, column) for column in values.T], 1) / count[:, None]
         for values in (places, colors))
-    kept = (views >= _AGREE) & ~_seen_through(places, searched)
+    kept = (views >= LEAST_WITNESSES) & ~_seen_through(places, searched)
     return places[kept], colors[kept].astype(np.uint8)
 
 
@@ -183,7 +180,7 @@ def _seen_through(
 
 def faces(view: TrainView, content: Background, points: NDArray[np.float64]) -> bool:
     """Tells whether a view sees places far outside, past the points [P, 3]."""
-    small = reduce_to(view, _SEARCH_SIDE)
+    small = reduce_to(view, SEARCH_SIDE)
     _, column, line, _ = small.camera.find_visible(content.positions)
     return int((~_cover_mask(small, points)[line, column]).sum()) >= _FACING
 

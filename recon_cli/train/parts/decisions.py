@@ -17,8 +17,8 @@ THRESHOLD_DB = 0.05
 _ERRORS = 1.65  # standard errors, a chance of about one in twenty
 _ERRORS_AGAINST = 1.0  # of a loss; what is on without a trial needs less to go off
 LEAST_SCORED = 8  # whose mean has a standard error that can be told; fewer, and the split is own
-_SPLIT = 6  # each sixth training view is held out by an own split, or sooner each third or more
-_DENSEST = 3  # of few views; the rest must still hang together
+# Each third to sixth training view is held out by an own split; the rest must still hang together.
+_SPLIT = (3, 6)
 
 Arm = Callable[[], Sequence[float]]
 NO_TIME = "there was no time to try it"  # the reason of what is decided without
@@ -93,7 +93,7 @@ def split(training: int, validation: int) -> Split | None:
     """
     if validation >= LEAST_SCORED:
         return Split(tuple(range(training)), tuple(range(validation)), own=False)
-    step = max(_DENSEST, min(_SPLIT, training // LEAST_SCORED))
+    step = max(_SPLIT[0], min(_SPLIT[1], training // LEAST_SCORED))
     held_out = tuple(range(step // 2, training, step))
     if len(held_out) < LEAST_SCORED:
         return None

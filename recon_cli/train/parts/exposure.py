@@ -19,7 +19,7 @@ from recon_cli.workspace.summaries import PhotometrySummary
 
 # Falling to a tenth as in INRIA 3DGS, but lower: on two phone videos, held-out views gained .72 and
 # .25 dB with .003, but .17 and -.01 dB with .01 (after the best gain of each view).
-_RATE, _FINAL_RATE = 0.003, 0.0003
+_RATES = (0.003, 0.0003)
 
 
 class Exposure(FittedPart):
@@ -46,7 +46,7 @@ class Exposure(FittedPart):
 
     def step(self, image: int, gradient: ResponseGradient, done: float) -> None:
         """Moves one image's gains; the rate falls as `done` goes from 0 to 1."""
-        self._rows.step(image, gradient.log_gain, _RATE * (_FINAL_RATE / _RATE) ** done)
+        self._rows.step(image, gradient.log_gain, _RATES[0] * (_RATES[1] / _RATES[0]) ** done)
         self._rows.center()
 
     def add_to(self, summary: PhotometrySummary) -> PhotometrySummary:

@@ -22,27 +22,21 @@ from recon_cli.deadline import Deadline, OutOfTime
 from recon_cli.io.images import reduce_to, reduce_view
 from recon_cli.io.views import evenly_spread
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.train.masks import Regions, enlarge, hide
 from recon_cli.train.parts.decisions import NO_TIME, Rule, decide, skip_trial
-from recon_cli.train.parts.moving_regions import (
-    SIDE,
-    SURE,
-    ComparedView,
-    compare_view,
-    find_moving,
-)
-from recon_cli.train.parts.part import LEVEL, Part, Sign, TrialScene
+from recon_cli.train.parts.moving_regions import SURE, ComparedView, compare_view, find_moving
+from recon_cli.train.parts.part import LEVEL, SEARCH_SIDE, SEARCHED_VIEWS, Part, Sign, TrialScene
 from recon_cli.workspace.summaries import TrialDecision
 
 if TYPE_CHECKING:
     from recon_cli.train.parts.trials import Trials
 
 FINER = 2  # times as large are the images of the last round as those of the first
-_PREVIEW = 60  # views, evenly spread
 # Of them must show what moves. Where nothing moves it was up to 4%, from things near the border of
 # few views that a short model lacks; of people in a third of the views 15% and more were found.
-_DETECTED, _LEAST_DETECTED = 0.08, 3
+_DETECTED = 0.08
 _MOST = 0.25  # of all pixels; more are not people who walk through, but a model that is wrong
 # How far beyond the spread of the others a region is that is masked, once there is a sign that
 # something moves. The spread is then larger, as the model has ghosts: with 12, as for the sign, two
@@ -65,14 +59,14 @@ class ViewComparer:
     backend: str
 
     def regions(
-        self, splats: Splats, views: Sequence[TrainView], side: int = SIDE, *,
+        self, splats: Splats, views: Sequence[TrainView], side: int = SEARCH_SIDE, *,
         agreed: float = _LIKELY,
     ) -> Regions:
         """Returns where each view shows what moves, at its size reduced to `side` pixels."""
         return find_moving(self.compare(splats, views, side), agreed=agreed)
 
     def compare(
-        self, splats: Splats, views: Sequence[TrainView], side: int = SIDE
+        self, splats: Splats, views: Sequence[TrainView], side: int = SEARCH_SIDE
     ) -> list[ComparedView]:
         """Returns views, reduced to `side` pixels, beside their renders."""
         return [compare_view(splats, view, self.sh_degree, self.backend, side=side)
@@ -81,7 +75,7 @@ class ViewComparer:
 
 def preview_rows(count: int) -> NDArray[np.int64]:
     """Returns which of `count` views are compared first, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, _PREVIEW).round().astype(np.int64))
+    return np.unique(np.linspace(0, count - 1, SEARCHED_VIEWS).round().astype(np.int64))
 
 
 def find_detections(compared: Sequence[ComparedView]) -> NDArray[np.bool_]:
@@ -91,7 +85,7 @@ def find_detections(compared: Sequence[ComparedView]) -> NDArray[np.bool_]:
 
 def have_evidence(detections: NDArray[np.bool_]) -> bool:
     """Returns whether so many views show something that moves that masks are worth a search."""
-    return int(detections.sum()) >= max(_LEAST_DETECTED, _DETECTED * len(detections))
+    return int(detections.sum()) >= max(MIN_OBSERVATIONS, _DETECTED * len(detections))
 
 
 def search(
@@ -107,9 +101,9 @@ def search(
         comparer: how they are compared.
         probe: trains on views without their regions.
     """
-    views = [reduce_to(view, FINER * SIDE) for view in views]
+    views = [reduce_to(view, FINER * SEARCH_SIDE) for view in views]
     regions = comparer.regions(splats, views)
-    for side in (SIDE, FINER * SIDE):
+    for side in (SEARCH_SIDE, FINER * SEARCH_SIDE):
         if not any(region.any() for region in regions):
             break
         masked = hide(views, regions)
@@ -126,8 +120,8 @@ def find_in_held_out(
     comparer: ViewComparer,
 ) -> Regions:
     """Returns where held-out views contradict those that a model was trained on, [H, W] each."""
-    compared, witnesses = (comparer.compare(splats, views, FINER * SIDE)
-                           for views in (held_out, evenly_spread(training, _PREVIEW)))
+    compared, witnesses = (comparer.compare(splats, views, FINER * SEARCH_SIDE)
+                           for views in (held_out, evenly_spread(training, SEARCHED_VIEWS)))
     return [enlarge(region, view.camera.width, view.camera.height)
             for region, view in zip(find_moving(compared, witnesses), held_out, strict=True)]
 
@@ -176,7 +170,7 @@ def _find_masks(trials: Trials, config: RunConfig) -> tuple[TrialDecision, Regio
         return skip_trial("moving", "there are too few views to tell"), []
     comparer = ViewComparer(config.sh_degree, task.backend)
     # by which views are reduced, to no less than those that are compared
-    level = max(1, min(LEVEL, round(_longest(views[0]) / SIDE)))
+    level = max(1, min(LEVEL, round(_longest(views[0]) / SEARCH_SIDE)))
     model = trials.model(config, level)
     order = np.argsort(trials.scene.names) if trials.scene.names else np.arange(len(views))
     rows = order[preview_rows(len(views))]
@@ -212,7 +206,7 @@ def _train_finer(
 ) -> Splats:
     """Returns a model of views reduced to `side` pixels, and of as many more Gaussians."""
     factor = max(1.0, max(map(_longest, views)) / side)
-    return trials.fit(config, views, factor=factor, finer=side / SIDE).splats
+    return trials.fit(config, views, factor=factor, finer=side / SEARCH_SIDE).splats
 
 
 def _try_masks(

@@ -19,26 +19,25 @@ from recon_cli.io.images import reduce_to
 from recon_cli.render.surface_depth import render_surface
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+from recon_cli.scene.statistics import MIN_OBSERVATIONS, OUTLIER_SIGMAS, at_least
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import unproject
+from recon_cli.stereo.depths import COMPARED, unproject
+from recon_cli.train.parts.part import SEARCH_SIDE
 
-SIDE = 150  # pixels of the longer side of the views that are compared
-_OTHERS = 14  # views that each is compared with, spread over all that show the same
-_LEAST = 3  # of them must see a surface to contradict a view
 _SHARED = 0.15  # of a view's surface that another must see to be one of them
 _GRID = 6  # pixels from one to the next that are looked at to tell that
 _TOLERANCE = 0.06  # of a depth, within which two views see the same surface
 _SMOOTH = 1.0  # pixels, standard deviation: small errors of poses do not count
+# Pixels that two of them reach: from the middle of a region to its border at least, as edges of
+# things are thin, and what a region is widened by.
+_MARGIN = round(2 * _SMOOTH)
 _DARK = 0.06  # brightness from which a pixel tells the gain of a view
 # A region begins where the contradiction is beyond all noise and ends where it is no more. Noise is
 # the capture's own: the median over all pixels of all views.
-_STRONG, _WEAK = 8.0, 3.0  # times the noise
-# Of the brightness. A shadow begins faintly: what is fainter than _TELLS only adds to a region.
-_LEAST_STRONG, _TELLS, _LEAST_WEAK = 0.10, 0.04, 0.025
-_BEYOND = 3.0  # times the spread of the others
+# The brightness of the one and of the other: at least, and in noises.
+_STRONG, _WEAK = (0.10, 8.0), (0.025, OUTLIER_SIGMAS)
+_TELLS = 0.04  # brightness; shadows begin faintly: what is fainter only adds to a region
 _AREA = 0.004  # of a view's pixels; smaller regions are errors of the model
-_THICK = 2.0  # pixels from the middle of a region to its border; edges of things are thin
-_MARGIN = 2  # pixels that a region is widened by
 # Half of a region must be this many times beyond the spread of the others, who must agree. After a
 # short run it was 15 and more for 40 made people and 30 for a monitor that shows something else
 # (desk_monitors), up to 10.8 for gloss, windows, vignettes and poor surfaces in nine captures.
@@ -67,7 +66,7 @@ class ComparedView:
 
 
 def compare_view(
-    splats: Splats, view: TrainView, sh_degree: int, backend: str, *, side: int = SIDE
+    splats: Splats, view: TrainView, sh_degree: int, backend: str, *, side: int = SEARCH_SIDE
 ) -> ComparedView:
     """Returns a view, reduced to `side` pixels, beside its render."""
     small = reduce_to(view, side)
@@ -95,7 +94,7 @@ def _smooth(error: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def find_overlapping(
-    own: ComparedView, views: Sequence[ComparedView], most: int = _OTHERS
+    own: ComparedView, views: Sequence[ComparedView], most: int = COMPARED
 ) -> NDArray[np.int64]:
     """Returns which of `views` see the surface of another view, spread evenly over the capture."""
     pixels = _grid(own.depth)
@@ -168,7 +167,7 @@ def contradict(
         column, line, _ = _project(other.camera, where[visible])
         row[visible] = _sample(other.error, column, line)
     count = np.isfinite(errors[..., 0]).sum(axis=0)
-    has_evidence = count >= _LEAST
+    has_evidence = count >= MIN_OBSERVATIONS
     errors, rows = errors[:, has_evidence], (count[has_evidence] - 1) // 2
     middle = _median(errors, rows)
     mine = own.error.reshape(-1, 3)[pixels[has_evidence]]
@@ -231,8 +230,8 @@ def _thresholds(
     beyond: NDArray[np.float32], noise: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Returns where an error is strong, and where it is weak or strong."""
-    strong = _morphed(beyond > max(_LEAST_STRONG, _STRONG * noise), cv2.MORPH_OPEN, 1)
-    weak = strong | (beyond > max(_LEAST_WEAK, _WEAK * noise))
+    strong = _morphed(beyond > at_least(_STRONG, noise), cv2.MORPH_OPEN, 1)
+    weak = strong | (beyond > at_least(_WEAK, noise))
     return strong, _morphed(weak, cv2.MORPH_CLOSE, 2)
 
 
@@ -243,7 +242,7 @@ def _components(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     inside = cv2.distanceTransform(small, cv2.DIST_L2, 3)
     return [region for label in range(1, count)
             if stats[label, cv2.CC_STAT_AREA] >= _AREA * mask.size
-            and inside[region := labels == label].max() >= _THICK]
+            and inside[region := labels == label].max() >= _MARGIN]
 
 
 def _is_large(region: NDArray[np.bool_], strong: NDArray[np.bool_]) -> bool:
@@ -254,12 +253,13 @@ def find_regions(
     contradiction: Contradiction, noise: float, agreed: float = SURE
 ) -> NDArray[np.bool_]:
     """Returns where a view shows what moves, [H, W]: connected, large and contradicted."""
-    strong, weak = _thresholds(contradiction.amount - _BEYOND * contradiction.spread, noise)
+    strong, weak = _thresholds(contradiction.amount - OUTLIER_SIGMAS * contradiction.spread, noise)
     ratio = contradiction.amount / (contradiction.spread + _SPREAD_FLOOR)
     result = np.zeros(weak.shape, np.bool_)
     for region in _components(weak):
         # what others do not see belongs to a region that they contradict, and makes none
-        has_evidence = region & (contradiction.visible >= _LEAST) & (contradiction.amount >= _TELLS)
+        has_evidence = (region & (contradiction.visible >= MIN_OBSERVATIONS)
+                        & (contradiction.amount >= _TELLS))
         if (_is_large(has_evidence, strong)
                 and np.median(ratio[has_evidence]) >= agreed
                 and np.quantile(contradiction.amount[has_evidence], 0.9) >= _CLEAR

@@ -25,6 +25,9 @@ from recon_cli.train.parts.photometry import FittedPart
 if TYPE_CHECKING:
     from recon_cli.train.parts.trials import Trials
 
+# Views that a search looks at, evenly spread, and pixels of their longer side, whatever the size in
+# training: in smaller ones the points around a window would close it.
+SEARCHED_VIEWS, SEARCH_SIDE = 60, 150
 LEVEL = 4  # images of a trial are reduced by this: a step takes a tenth, and parts still differ
 AUTO = "auto"  # the value of an option that a sign or a trial decides
 

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon_cli.scene.statistics import COARSE_SAMPLE, LEAST_SHARED, UNCLIPPED
 from recon_cli.scene.train_view import TrainView
 
 _SIDE = 100  # pixels of the longer side; a small view is denoised and does not mind blur
-_POINTS = 4000  # enough for medians of hundreds of points in two views that share a tenth
-_LEAST = 40  # points that two views must share; their median is known to a fifth of their spread
-_DARK, _BRIGHT = 12 / 255, 243 / 255  # means over a block; beyond, pixels of it may be clipped
 # Spread from which a capture drifts. Measured: up to .0194 in clean room videos (from gloss), .0326
 # to .0519 in rooms whose gain drifts by .82 to 1.42, .06 and more in photos.
 _DRIFTS = 0.025
@@ -77,9 +75,9 @@ def estimate_gains(
 
 def choose_points(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
     """Returns the points [P, 3], of more than 4,000 a seeded draw."""
-    if len(points) <= _POINTS:
+    if len(points) <= COARSE_SAMPLE:
         return points
-    return points[np.sort(np.random.default_rng(seed).permutation(len(points))[:_POINTS])]
+    return points[np.sort(np.random.default_rng(seed).permutation(len(points))[:COARSE_SAMPLE])]
 
 
 def log_colors(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float64]:  # [P, 3]
@@ -90,7 +88,8 @@ def log_colors(view: TrainView, points: NDArray[np.float64]) -> NDArray[np.float
     inside = (line < image.shape[0]) & (column < image.shape[1])
     colors = np.full((len(points), 3), np.nan)
     colors[rows[inside]] = image[line[inside], column[inside]]
-    fair = ((colors > _DARK) & (colors < _BRIGHT)).all(axis=1, keepdims=True)
+    dark, bright = (level / 255 for level in UNCLIPPED)
+    fair = ((colors > dark) & (colors < bright)).all(axis=1, keepdims=True)
     return np.log(np.where(fair, colors, np.nan))
 
 
@@ -115,7 +114,7 @@ def _pairs(logs: NDArray[np.float64]) -> _Pairs:
     for first in range(len(logs)):
         for second in range(first + 1, len(logs)):
             both = visible[first] & visible[second]
-            if (count := int(both.sum())) < _LEAST:
+            if (count := int(both.sum())) < LEAST_SHARED:
                 continue
             ratios = logs[second, both] - logs[first, both]
             middle = np.median(ratios, axis=0)

@@ -17,24 +17,24 @@ from numpy.typing import NDArray
 from recon_cli.deadline import Deadline
 from recon_cli.io.images import reduce_to
 from recon_cli.scene.covisibility import observe_points
+from recon_cli.scene.statistics import COARSE_SAMPLE, LEAST_WITNESSES
 from recon_cli.scene.train_view import TrainView
-from recon_cli.stereo.depths import StereoView, find_depths, find_partners, unproject
+from recon_cli.scene.voxels import SURFACE_CELL, number_cells
+from recon_cli.stereo.depths import (
+    LEAST_SEEN,
+    NEAREST,
+    StereoView,
+    find_depths,
+    find_partners,
+    spanned,
+    unproject,
+)
 from recon_cli.train.fit.task import Evidence, Task
-from recon_cli.train.parts.part import Part, Sign, Start
+from recon_cli.train.parts.part import SEARCHED_VIEWS, Part, Sign, Start
 from recon_cli.train.parts.sparse_points import estimate_gains
 
-_VIEWS = 60  # searched, evenly spread
 _SIDE = 300  # pixels of their longer side
 _NEIGHBOURS = 10  # views that each is compared with
-_SAMPLES = 4000  # sparse points looked at to find them
-_LEAST_SEEN = 10  # sparse points that tell between which depths a view is searched
-_TAIL = 0.01  # of them, which do not count
-_NEAR = 0.02  # of the median depth; nothing nearer to a camera is a surface
-# Side of the cells that get one point each, in median depths: 10 cm in a room. Finer Gaussians go
-# where the error is, in the run.
-_CELL = 1 / 25
-_AGREE = 2  # views that find a surface in a cell
-_HALF = 1 << 20  # cells on each side of the origin
 
 logger = logging.getLogger("recon")
 
@@ -72,23 +72,23 @@ def find_surfaces(evidence: Evidence, deadline: Deadline | None = None) -> Surfa
     deadline, views, points = deadline or Deadline(), evidence.views, evidence.points
     tracks = evidence.tracks()
     rows = np.unique(np.linspace(
-        0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int))
+        0, len(views) - 1, min(len(views), SEARCHED_VIEWS)).round().astype(int))
     chosen = [reduce_to(views[row], _SIDE) for row in rows]
     seen = _visibility(chosen, [tracks[row] for row in rows], points)
     depths = [view.camera.viewmat[2, :3] @ points[mine].T + view.camera.viewmat[2, 3]
               for view, mine in zip(chosen, seen, strict=True)]
     depths = [depth[depth > 0] for depth in depths]
-    usable = [len(depth) >= _LEAST_SEEN for depth in depths]
-    if sum(usable) < _AGREE:
+    usable = [len(depth) >= LEAST_SEEN for depth in depths]
+    if sum(usable) < LEAST_WITNESSES:
         return SurfacePoints.nothing()
     chosen, depths = (list(compress(every, usable)) for every in (chosen, depths))
     seen = seen[usable]
     gains = np.exp(estimate_gains(chosen, points).log_gains.mean(axis=1))
     photos = [
-        StereoView(view, float(np.quantile(depth, _TAIL)), float(np.quantile(depth, 1 - _TAIL)),
-                   float(gain)) for view, depth, gain in zip(chosen, depths, gains, strict=True)]
+        StereoView(view, *spanned(depth), float(gain))
+        for view, depth, gain in zip(chosen, depths, gains, strict=True)]
     median = float(np.median(np.concatenate(depths)))
-    some = np.random.default_rng(0).permutation(len(points))[:_SAMPLES]
+    some = np.random.default_rng(0).permutation(len(points))[:COARSE_SAMPLE]
     partners = find_partners(
         [view.camera for view in chosen], points[some], seen[:, some], _NEIGHBOURS)
     total = 2 * len(photos)
@@ -99,8 +99,8 @@ def find_surfaces(evidence: Evidence, deadline: Deadline | None = None) -> Surfa
             bar.advance()
             pace(next(done))
 
-        found = find_depths(photos, partners, _NEAR * median, advance)
-    return _merge(chosen, found, points, _CELL * median)
+        found = find_depths(photos, partners, NEAREST * median, advance)
+    return _merge(chosen, found, points, SURFACE_CELL * median)
 
 
 def _visibility(
@@ -121,12 +121,12 @@ def _merge(
     sparse: NDArray[np.float64], side: float,
 ) -> SurfacePoints:
     """Returns the mean place and colour in each cell of this side that two views find."""
-    taken = np.unique(_cells(sparse, side))
+    taken = np.unique(number_cells(sparse, side))
     parts = []
     for view, depth in zip(views, depths, strict=True):
         pixels = np.flatnonzero(depth > 0)
         where = unproject(view.camera, depth, pixels)
-        cells, inverse = np.unique(_cells(where, side), return_inverse=True)
+        cells, inverse = np.unique(number_cells(where, side), return_inverse=True)
         values = np.column_stack([where, view.image.reshape(-1, 3)[pixels], np.ones(len(pixels))])
         sums = np.stack([np.bincount(inverse, column, len(cells)) for column in values.T], axis=1)
         free = ~np.isin(cells, taken)
@@ -134,15 +134,9 @@ def _merge(
     every, of = np.unique(np.concatenate([cells for cells, _ in parts]), return_inverse=True)
     sums = np.concatenate([sums for _, sums in parts])
     total = np.stack([np.bincount(of, column, len(every)) for column in sums.T], axis=1)
-    total = total[np.bincount(of, minlength=len(every)) >= _AGREE]
+    total = total[np.bincount(of, minlength=len(every)) >= LEAST_WITNESSES]
     means = total[:, :-1] / total[:, -1:]
     return SurfacePoints(means[:, :3], means[:, 3:].round().astype(np.uint8))
-
-
-def _cells(where: NDArray[np.float64], side: float) -> NDArray[np.int64]:
-    """Returns the number of the cell of each place [N, 3]."""
-    at = np.clip(np.floor(where / side), -_HALF, _HALF - 1).astype(np.int64) + _HALF
-    return np.asarray((at[:, 0] * 2 * _HALF + at[:, 1]) * 2 * _HALF + at[:, 2])
 
 
 def surfaces_of(task: Task, evidence: Evidence, deadline: Deadline | None = None) -> SurfacePoints:

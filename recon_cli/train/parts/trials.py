@@ -37,8 +37,7 @@ from recon_cli.workspace.summaries import TrialDecision
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
 _STEPS = 400
 _FURTHER = 10 / 7  # times the means' rate of a full run: they have to get there in fewer steps
-_POINTS = 5000
-_CAP = 10_000
+_CAP = 10_000  # Gaussians; half of them at the start
 
 
 @dataclass(frozen=True)
@@ -227,7 +226,7 @@ class Trials:
                                      means_rate=_FURTHER * recipe.means_rate)
         small = replace(self.task, train=[reduce_view(view, factor) for view in views],
                         validation=[], schedule=Schedule(config, recipe), cell=None)
-        state = first_state(small, self.scene.points, self.scene.colors, most=_POINTS)
+        state = first_state(small, self.scene.points, self.scene.colors, most=_CAP // 2)
         pace = self.deadline.keep_pace(config.iterations * max(1, self._runs))
         fit(state, small, config.iterations, (_PaceCallback(pace),) if limited else ())
         self.longest = max(self.longest, self.deadline.spent - begun)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from recon_cli.render.response import Response, ResponseGradient, lens
 from recon_cli.scene.camera import Camera
+from recon_cli.scene.statistics import MIN_OBSERVATIONS, REFIT_ROUNDS
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit.task import Evidence, Task
 from recon_cli.train.parts.decisions import Rule
@@ -34,8 +35,6 @@ from recon_cli.workspace.summaries import PhotometrySummary, VignetteSummary
 
 _RATE, _FALL = 0.002, 0.1  # of the exponents; it falls to a tenth, as that of exposures does
 _DARKEST = 1.5  # of -(a + b): a corner with a fifth of the light, as of a fast lens wide open
-_LEAST_VIEWS = 3  # that a point needs to say anything
-_ROUNDS = 4  # of weights
 _DOUBT = 1.5  # times the median residual, from which weights fall
 _BEND_PRIOR = 0.2  # standard deviation of a bend before the points are asked
 # Loss from which a vignette is worth a trial. Measured: .1 and 1% in two rendered rooms, 3 to 10%
@@ -68,7 +67,7 @@ def find_vignettes(
     """Returns the vignette of each camera from the colours of points [P, 3]."""
     points = choose_points(points, seed)
     logs = np.log(np.exp(np.stack([log_colors(view, points) for view in views])).mean(axis=2))
-    kept = np.isfinite(logs).sum(axis=0) >= _LEAST_VIEWS
+    kept = np.isfinite(logs).sum(axis=0) >= MIN_OBSERVATIONS
     if not kept.any():
         return VignetteEvidence.nothing(views)
     squares = np.stack([_squares(view, points[kept]) for view in views])
@@ -108,7 +107,7 @@ def _solve(
     columns = [np.where(seen & (groups == group)[:, None], squares**power, 0.0)
                for group in range(cameras) for power in (1, 2)]
     weights = seen.astype(np.float64)
-    for _ in range(_ROUNDS):
+    for _ in range(REFIT_ROUNDS):
         normal, right = _normal_equations(logs, weights, slope, columns)
         solved = np.linalg.lstsq(normal, right, rcond=1e-10)[0]
         gains, bends, exponents = solved[:views], solved[views:2 * views], solved[2 * views:]

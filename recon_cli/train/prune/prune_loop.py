@@ -23,7 +23,7 @@ from recon_cli.train.fit.task import Task
 RATIO = 0.5  # that is removed where no limit is given
 # Share of the recovery by which the last round is over; what is left mends it. docs/pruning.md
 LAST_ROUND = 0.5
-_LEAST_ROUNDS, _MOST_ROUNDS = 3, 8  # more gained nothing. docs/pruning.md
+ROUND_COUNTS = (3, 8)  # least and most, which gained as much as more. docs/pruning.md
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def remaining(n: int, ratio: float) -> int:
 
 def rounds_within(recovery: int, views: int) -> int:
     """Returns how many rounds (3 to 8) a recovery has room for: one for each epoch."""
-    return min(_MOST_ROUNDS, max(_LEAST_ROUNDS, int(LAST_ROUND * recovery) // max(1, views)))
+    return min(ROUND_COUNTS[1], max(ROUND_COUNTS[0], int(LAST_ROUND * recovery) // max(1, views)))
 
 
 def plan_removals(n: int, target: int, rounds: int, recovery: int) -> tuple[Removal, ...]:

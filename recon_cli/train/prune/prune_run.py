@@ -31,7 +31,13 @@ from recon_cli.train.fit.state import TrainState, save_state
 from recon_cli.train.fit.task import Task
 from recon_cli.train.fit.train_data import load_task, read_config
 from recon_cli.train.masks import with_masks
-from recon_cli.train.prune.prune_loop import PruneRun, remaining, rounds_within
+from recon_cli.train.prune.prune_loop import (
+    LAST_ROUND,
+    ROUND_COUNTS,
+    PruneRun,
+    remaining,
+    rounds_within,
+)
 from recon_cli.workspace.atomic import delete, read_json, write_bytes
 from recon_cli.workspace.records import ImportRecord
 from recon_cli.workspace.summaries import JsonRecord, TrainPlan
@@ -41,7 +47,6 @@ logger = logging.getLogger("recon")
 ROUNDS = "rounds.json"
 GOOD = "good.safetensors"  # the last state whose validation PSNR was good enough
 _END_RECOVERY = 6  # the reference recovers for 5,000 steps after 30,000
-_END_EPOCHS = 6  # three rounds in its first half, each scored by an epoch of its own
 # Share that a round of the search removes at first; halved when too much, down to the least
 _SEARCH_SHARE = 0.25
 _LEAST_SHARE = 0.05
@@ -125,8 +130,11 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
 
 
 def count_recovery_steps(iterations: int, epoch: int) -> int:
-    """Returns the steps after which a finished model has recovered; `epoch` in steps."""
-    return max(iterations // _END_RECOVERY, _END_EPOCHS * epoch)
+    """Returns the steps after which a finished model has recovered; `epoch` in steps.
+
+    The fewest rounds have room before the last one, each scored by an epoch of its own.
+    """
+    return max(iterations // _END_RECOVERY, round(ROUND_COUNTS[0] / LAST_ROUND) * epoch)
 
 
 def _was_continued(train: Path) -> bool:
