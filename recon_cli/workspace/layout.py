@@ -57,6 +57,7 @@ class Workspace:
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
+        self._manifests: dict[Path, tuple[os.stat_result, Manifest]] = {}  # as they were read
 
     @property
     def holds_results(self) -> bool:
@@ -129,8 +130,19 @@ class Workspace:
         folder, name = self.folder(stage), manifest_name(stage)
         if not _has_manifest(folder, name):
             return None
-        manifest = Manifest.read(folder, name)
+        manifest = self._read_manifest(folder, name)
         return manifest if manifest.key.stage != "sfm" or stage == "sfm" else manifest.as_place()
+
+    def _read_manifest(self, folder: Path, name: str) -> Manifest:
+        """Returns a manifest, which is read again once its file is another one."""
+        known = self._manifests.get(folder / name)
+        try:
+            now = (folder / name).stat()
+        except OSError:  # which is said by whoever reads it
+            return Manifest.read(folder, name)
+        if known is None or not _is_same(known[0], now):
+            known = self._manifests[folder / name] = now, Manifest.read(folder, name)
+        return known[1]
 
     def partial_run(self, stage: str) -> PartialRun | None:
         """Returns how far an interrupted run of a stage came, or None."""
@@ -374,6 +386,12 @@ def _is_in_use(leftover: Path) -> bool:
     """Returns whether the process that writes a file still runs: a report takes no lock."""
     number = re.search(r"\.tmp(\d+)", leftover.name)
     return number is not None and psutil.pid_exists(int(number[1]))
+
+
+def _is_same(before: os.stat_result, now: os.stat_result) -> bool:
+    """Returns whether a file is the one of before: replaced ones are files of their own."""
+    return all(getattr(before, sign) == getattr(now, sign)
+               for sign in ("st_ino", "st_size", "st_mtime_ns"))
 
 
 def _has_manifest(folder: Path, name: str = manifest.NAME) -> bool:
