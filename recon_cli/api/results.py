@@ -118,7 +118,7 @@ class ModelResult(StageResult[S]):
     @cached_property
     def curve(self) -> TrainingCurve:
         """How the loss, the validation PSNR and the number of Gaussians went; none of an import."""
-        rows = [row for row in LogRow.read_all(self.folder / "log.jsonl")
+        rows = [row for row in LogRow.read_all(self.folder / LogRow.FILE)
                 if row.gaussians is not None]
         nan = float("nan")
         return TrainingCurve(

@@ -28,7 +28,8 @@ from recon_cli.train.fit.task import Task
 from recon_cli.train.fit.train_data import load_task
 from recon_cli.train.parts.table import PARTS, model_parts
 from recon_cli.train.plan import choose_parts
-from recon_cli.workspace.digests import digest_file, sha256_json
+from recon_cli.workspace.digests import digest_file
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.layout import Workspace
 
 _READ = ("images", "denoised", "masks", "sparse")  # the inputs of training, below place/undistorted

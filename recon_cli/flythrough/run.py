@@ -56,7 +56,7 @@ from recon_cli.workspace.atomic import (
     read_json,
     write_json,
 )
-from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
 from recon_cli.workspace.steps import StepFolder
 

@@ -59,7 +59,7 @@ from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.fit.runner import LOG, seconds_at
+from recon_cli.train.fit.runner import seconds_at
 from recon_cli.train.masks import with_masks
 from recon_cli.train.parts.moving import FINER, ViewComparer, find_in_held_out
 from recon_cli.train.parts.moving_regions import SIDE
@@ -67,7 +67,7 @@ from recon_cli.train.parts.photometry import read_falloffs
 from recon_cli.trust.assess import TrustTask, assess
 from recon_cli.workspace.atomic import write_json, write_text
 from recon_cli.workspace.records import describe_stretches
-from recon_cli.workspace.summaries import EvaluateSummary
+from recon_cli.workspace.summaries import EvaluateSummary, LogRow
 
 _GAIN = 4  # of the difference images
 _ANY_ITERATION = 1 << 62  # beyond the last
@@ -136,7 +136,7 @@ class _Evaluation:
             name: mean_psnr(splats, views, degree, backend, corrected=self.gains, threads=threads,
                             falloffs=falloffs, on_view=seen)
             for name, views in self.training_views.items()}
-        log = self.folders[model] / LOG
+        log = self.folders[model] / LogRow.FILE
         seconds = None if self.trained.import_record else seconds_at(log, _ANY_ITERATION)
         return ModelMetrics.from_views(
             scores.views, gaussians=len(splats),

@@ -21,7 +21,6 @@ from recon_cli.errors import ConfigError, name_command
 from recon_cli.scene.splats import Splats, with_rows
 from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit.initialize import begin_state, restore_state
-from recon_cli.train.fit.runner import LOG
 from recon_cli.train.fit.schedule import Schedule
 from recon_cli.train.fit.state import DensificationStats, TrainState, read_progress
 from recon_cli.train.fit.task import Task
@@ -125,7 +124,7 @@ class FinishedModel:
             if schedule.steps < _FEW * self.steps:
                 ctx.notice(f"{schedule.steps:,} more steps than {self.steps:,} are too few to gain "
                            "anything: learning rates start anew")
-            write_bytes(out / LOG, _renumbered(LogRow.read_all(self.folder / LOG)))
+            write_bytes(out / LogRow.FILE, _renumbered(LogRow.read_all(self.folder / LogRow.FILE)))
         record = self.import_record
         if record is None:
             return

@@ -12,7 +12,7 @@ from recon_cli.io.views import size_summary
 from recon_cli.scene.scene import Scene
 from recon_cli.splats.ply import write_ply
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.fit.runner import CHECKPOINT, LOG, RunSegment, run_fit
+from recon_cli.train.fit.runner import CHECKPOINT, RunSegment, run_fit
 from recon_cli.train.fit.state import TrainState, save_state
 from recon_cli.train.fit.task import Task
 from recon_cli.train.masks import EditedMasks, read_summary
@@ -51,7 +51,8 @@ def fit_scene(
 def _summarize(
     state: TrainState, task: Task, out: Path, ctx: StageContext, import_record: ImportRecord | None
 ) -> TrainSummary:
-    config, plan, last = task.schedule.config, TrainPlan.read(out), LogRow.read_all(out / LOG)[-1]
+    config, plan = task.schedule.config, TrainPlan.read(out)
+    last = LogRow.read_all(out / LogRow.FILE)[-1]
     return TrainSummary(
         imported_from=import_record.file if import_record else None,
         continued_from_step=plan.continues_at or None,

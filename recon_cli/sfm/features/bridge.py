@@ -23,7 +23,6 @@ from recon_cli.io.images import read_png
 from recon_cli.sfm import database
 from recon_cli.sfm.features import matching, xfeat_weights
 from recon_cli.sfm.features.features import DESCRIPTOR_SCALE
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.features.xfeat import (
     DESCRIPTOR_STEPS,
     LONGER_SIDE,
@@ -34,6 +33,7 @@ from recon_cli.sfm.features.xfeat import (
 from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.limits import FEW_PAIR_MATCHES, MAX_TRIALS
 from recon_cli.sfm.mapping import mapper, skeleton
+from recon_cli.sfm.model_arrays import Pair
 
 ATTEMPT = "bridge"
 # Of a bridge: inliers of XFeat, their share of its mutual matches, and pixels that one may be off

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from recon_cli.io.tracks import Tracks
-from recon_cli.sfm.features.matching import Pair
+from recon_cli.sfm.model_arrays import Pair
 
 ALL = 200  # frames up to which all are keyframes
 # Tracks that a keyframe shares with the next one: of its own, and at least. No step is longer.

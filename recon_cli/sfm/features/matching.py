@@ -30,6 +30,7 @@ from recon_cli.sfm.limits import (
     MIN_PANORAMA_SHARE,
 )
 from recon_cli.sfm.mapping import checks
+from recon_cli.sfm.model_arrays import Pair
 from recon_cli.sfm.results import MatchesResult
 
 CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
@@ -51,7 +52,6 @@ CHUNK, PAIRS_AT_ONCE = 1024, 1000
 # second nearest. COLMAP's (SiftMatchingOptions).
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8
 
-Pair = tuple[str, str]  # file names in order
 Matches = NDArray[np.uint32]  # [M, 2] rows of the keypoints in either image
 
 

@@ -18,7 +18,6 @@ from scipy.sparse import lil_matrix
 from scipy.spatial.transform import Rotation
 
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.limits import (
     MAX_DRIFT,
     MAX_DRIFT_DEG,
@@ -30,6 +29,7 @@ from recon_cli.sfm.limits import (
     MIN_POSE_INLIERS,
     NEAR_IN_WALK,
 )
+from recon_cli.sfm.model_arrays import Pair
 from recon_cli.sfm.segments.shared_points import SegmentCameras, SharedPoints, estimate_similarity
 
 MOST_POINTS = 4000  # of two segments that a similarity is found from

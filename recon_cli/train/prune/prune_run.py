@@ -25,7 +25,7 @@ from recon_cli.train.finished_model import FINAL, FinishedModel
 from recon_cli.train.fit.importance import Importance
 from recon_cli.train.fit.initialize import make_finished_state, restore_state
 from recon_cli.train.fit.loop import validation_psnr
-from recon_cli.train.fit.runner import LOG, RunSegment, TrainLog, run_fit, seconds_at
+from recon_cli.train.fit.runner import RunSegment, TrainLog, run_fit, seconds_at
 from recon_cli.train.fit.schedule import RecoverySchedule
 from recon_cli.train.fit.state import TrainState, save_state
 from recon_cli.train.fit.task import Task
@@ -121,7 +121,7 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
         config.rounds or rounds_within(steps, epoch),
-        seconds_at(model.folder / LOG, start.iteration))
+        seconds_at(model.folder / start.iteration))
 
 
 def count_recovery_steps(iterations: int, epoch: int) -> int:
@@ -162,7 +162,7 @@ class StoredPruneRun(PruneRun):
         self._trained = 0.0, 0.0
         begin, cpu_begin = time.perf_counter(), time.process_time()
         score = super().score(until)
-        TrainLog(self._out / LOG, self.state.iteration, self.source.earlier_seconds).add_idle(
+        TrainLog(self._out / self.state.iteration, self.source.earlier_seconds).add_idle(
             self.state.iteration, time.perf_counter() - begin - self._trained[0],
             time.process_time() - cpu_begin - self._trained[1])
         return score
