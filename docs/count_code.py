@@ -2,7 +2,9 @@
 
 A line of code holds a token that is no comment and no docstring; lines are all of the file. A named
 numeric constant is a number, a sum of numbers or a tuple of them under an upper-case name at the
-top level of a module. Of functions the lines are all from `def` to the end.
+top level of a module. Of functions the lines are all from `def` to the end. The last line is the
+longest path of imports that loading a module takes: late ones, those for type checkers alone and
+the `__init__.py` of folders on the way do not count.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import sys
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "recon_cli"
@@ -75,6 +78,41 @@ def count_file(path: Path) -> Counter[str]:
         "over 50": sum(length > LONG for length in lengths)})
 
 
+def _loaded_imports(body: list[ast.stmt]) -> Iterator[str]:
+    """Yields the dotted names that a module imports as it is loaded."""
+    for node in body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            yield from _loaded_imports(node.orelse)
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            inner = (getattr(node, name, []) for name in ("body", "orelse", "finalbody"))
+            yield from _loaded_imports([each for part in inner for each in part])
+            yield from _loaded_imports([
+                each for handler in getattr(node, "handlers", []) for each in handler.body])
+
+
+def longest_import_path(root: Path) -> list[str]:
+    """Returns the modules of the longest path of imports; RecursionError for a circle."""
+    names = {".".join((root.name, *path.relative_to(root).with_suffix("").parts)).removesuffix(
+        ".__init__"): path for path in root.rglob("*.py")}
+
+    def find_module(name: str) -> str:
+        while name and name not in names:
+            name = name.rpartition(".")[0]
+        return name
+
+    @cache
+    def longest_from(module: str) -> list[str]:
+        tree = ast.parse(names[module].read_text(encoding="utf-8"))
+        below = {find_module(name) for name in _loaded_imports(tree.body)} - {"", module}
+        return [module, *max(map(longest_from, sorted(below)), key=len, default=[])]
+
+    return max(map(longest_from, sorted(names)), key=len)
+
+
 def _row(name: str, counts: Counter[str]) -> str:
     mean = counts["mean"] / max(1, counts["functions"])
     values = [f"{mean:.1f}" if key == "mean" else f"{counts[key]:,}" for key in COLUMNS]
@@ -91,6 +129,8 @@ def main() -> None:
     rows = [f"{'':<16}" + "".join(f"{key:>11}" for key in COLUMNS)]
     rows += [_row(name, counts) for name, counts in folders.items()]
     rows.append(_row("all", sum(folders.values(), Counter())))
+    longest = [name.partition(".")[2] for name in longest_import_path(root)]
+    rows.append(f"longest import path: {len(longest)} modules, {' > '.join(longest)}")
     sys.stdout.write("\n".join(rows) + "\n")
 
 

@@ -81,7 +81,7 @@ class StageInputs:
 
     # finished folder by stage name: of all in `needs`, and of those in `uses` that are fresh
     folders: Mapping[str, Path] = field(default_factory=dict)
-    sources: tuple[Path, ...] = ()  # the user's own files; only ingest has any
+    sources: tuple[Path, ...] = ()  # the user's own files, of ingest and import
     continues: Path | None = None  # finished result of the stage itself that the run continues
     digests: Mapping[str, str] = field(default_factory=dict)  # of the files in each of `folders`
     # what the stage of each of `folders` says about its result

@@ -20,7 +20,6 @@ import psutil
 
 from recon_cli import __version__, cgroups
 from recon_cli.errors import ConfigError, ReconError, ReconstructionError, causes
-from recon_cli.progress import RECORD_SECONDS
 
 DISTRIBUTION = "recon-gs"  # `recon-cli` on PyPI is somebody else's, with a command `recon` too
 _PACKAGES = {
@@ -42,6 +41,7 @@ _MEMORY_WORDS = (
 _CPUINFO = Path("/proc/cpuinfo")
 _LOW_PRIORITY = 5  # of POSIX: a third of the share of others; more, and who waits for it waits long
 POLL_SECONDS = 0.25  # between two looks at what another process or native code has done
+_SAMPLE_SECONDS = 2 * POLL_SECONDS  # a sample of all children takes about 5 ms
 
 
 def versions() -> dict[str, str]:
@@ -229,7 +229,7 @@ class Meter:
         self._sample()
 
     def _watch(self) -> None:
-        while not self._done.wait(RECORD_SECONDS):
+        while not self._done.wait(_SAMPLE_SECONDS):
             self._sample()
 
     def _sample(self) -> None:

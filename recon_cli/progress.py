@@ -15,9 +15,7 @@ from typing import Protocol
 
 from tqdm import tqdm
 
-# Between two records of how far something is: a person sees no difference, a flush to disk and a
-# sample of all children cost nothing so seldom.
-RECORD_SECONDS = 0.5
+RECORD_SECONDS = 0.5  # a person sees no difference, and a flush to disk costs nothing at this pace
 LINE_SECONDS = 20.0  # between two lines of a stage
 
 logger = logging.getLogger("recon.progress")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
 from recon_cli.workspace.json_record import JsonRecord
-from recon_cli.workspace.records import FOLDER, read_frame_list
+from recon_cli.workspace.records import FOLDER, FrameList, read_frame_list
 from recon_cli.workspace.summaries import (
     EvaluateSummary,
     ExportSummary,
@@ -46,16 +46,18 @@ class IngestResult(StageResult[IngestSummary]):
     """The frames that were chosen."""
 
     @cached_property
+    def _list(self) -> FrameList:
+        return read_frame_list(self.folder)
+
+    @property
     def frames(self) -> tuple[Path, ...]:
         """The files of the frames."""
-        return tuple(self.folder / FOLDER / frame.name
-                     for frame in read_frame_list(self.folder).frames)
+        return tuple(self.folder / FOLDER / frame.name for frame in self._list.frames)
 
-    @cached_property
+    @property
     def held_out(self) -> tuple[str, ...]:
         """The names of the frames that are held out for scores."""
-        return tuple(
-            frame.name for frame in read_frame_list(self.folder).frames if frame.held_out)
+        return tuple(frame.name for frame in self._list.frames if frame.held_out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +118,7 @@ class ModelResult(StageResult[S]):
     @cached_property
     def curve(self) -> TrainingCurve:
         """How the loss, the validation PSNR and the number of Gaussians went; none of an import."""
-        rows = [row for row in LogRow.read_all(self.folder / "log.jsonl")
+        rows = [row for row in LogRow.read_all(self.folder / LogRow.FILE)
                 if row.gaussians is not None]
         nan = float("nan")
         return TrainingCurve(

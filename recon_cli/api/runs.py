@@ -121,6 +121,7 @@ def make_options(config: StageConfig | None, options: dict[str, Any], section: s
     Without a config those of `options` alone. ConfigError if the section has no such option.
     """
     layers.check_names(section, options, where="The call")
-    fields = {} if config is None else {
-        item.name: getattr(config, item.name) for item in dataclasses.fields(config)}
+    settled = config and config.settle()
+    fields = {} if settled is None else {
+        item.name: getattr(settled, item.name) for item in dataclasses.fields(settled)}
     return {section: {**fields, **options}}

@@ -55,7 +55,9 @@ class ScannedVideo:
         return np.asarray(self.judgement.usable & itself)
 
 
-def scan(config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext) -> ScannedVideo:
+def load_or_scan(
+    config: IngestConfig, path: Path, scan_file: Path, ctx: IngestContext
+) -> ScannedVideo:
     """Returns a video after a pass over all of its frames; `scan_file` keeps it for a next run.
 
     InputError if it is not a video, has too few undamaged frames, or shows nothing or no motion.

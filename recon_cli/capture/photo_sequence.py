@@ -34,8 +34,7 @@ from recon_cli.capture.unreadable import BROKEN
 from recon_cli.errors import InputError
 from recon_cli.io.tracks import merge_tracks
 from recon_cli.progress import Bar
-from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.json_record import JsonRecord
+from recon_cli.workspace.json_record import JsonRecord, sha256_json
 from recon_cli.workspace.steps import StepFolder, log_path
 
 # A photo follows another where it still shows this share of the other's corners, and so do nearly

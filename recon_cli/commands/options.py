@@ -1,7 +1,7 @@
 """Command-line options: those that every verb has, and those made from the config dataclasses.
 
 An option stores its value in a `Call` and is passed to no function. A config field therefore is
-declared once, in config/stages.py, and only typed options reach the settings.
+declared once, below config/, and only typed options reach the settings.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from types import UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Self, get_args, get_origin, get_type_hints
 
 from recon_cli.errors import MOST_CHARACTERS, ConfigError, ReconError
 
@@ -166,6 +166,10 @@ class StageConfig:
     @classmethod
     def refuse_contradictions(cls, values: Mapping[str, Any]) -> None:
         """Raises ConfigError where options that are given, default or not, exclude each other."""
+
+    def settle(self) -> Self:
+        """Returns the options with those that others fix; ConfigError where they contradict."""
+        return self
 
     def hashed_fields(self) -> dict[str, Any]:
         """Returns the fields that affect the result, for the fingerprint; a tuple as a list."""

@@ -180,7 +180,7 @@ def check_names(section: str, names: Iterable[str], *, where: str) -> None:
 def _check_values(section: str, values: Mapping[str, Any], *, where: str) -> None:
     """Raises ConfigError, with `where` before its message, unless the values can be used."""
     try:
-        SECTIONS[section](**values)
+        SECTIONS[section](**values).settle()
     except ConfigError as error:
         raise ConfigError(f"{where}{error.message}", hint=error.hint) from error
     except OverflowError as error:  # an integer for a float
@@ -207,7 +207,7 @@ def build(config: type[C], settings: Mapping[str, Mapping[str, Any]]) -> C:
     """Returns the config of one class with the values of `settings`."""
     values = settings.get(section_of(config), {})
     config.refuse_contradictions(values)
-    return config(**values)
+    return config(**values).settle()
 
 
 def section_of(config: type[StageConfig]) -> str:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from recon_cli.config import protocols
 from recon_cli.config.fields import StageConfig, option
@@ -278,7 +279,6 @@ class TrainConfig(StageConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_number_of("train", "blocks", self.blocks)
-        self._follow_protocol()
         if self.mid < DENSIFY_UNTIL:
             raise ConfigError(
                 f"mid is {self.mid:g}, but densification runs until {DENSIFY_UNTIL:g} of the run "
@@ -290,10 +290,12 @@ class TrainConfig(StageConfig):
                 "the length of the training.",
                 hint="Leave out --iterations or --minutes, here and in recon.toml.")
 
-    def _follow_protocol(self) -> None:
-        """Sets what the protocol fixes; ConfigError where an option asks for something else."""
-        for name, value in protocols.fixed_options(self).items():
-            object.__setattr__(self, name, value)
+    def settle(self) -> Self:
+        """Returns the options with those that the protocol fixes, if it is not followed yet.
+
+        ConfigError where an option asks for something else.
+        """
+        return dataclasses.replace(self, **protocols.fixed_options(self))
 
     @classmethod
     def refuse_contradictions(cls, values: Mapping[str, Any]) -> None:
@@ -302,15 +304,7 @@ class TrainConfig(StageConfig):
 
 
 @dataclass(frozen=True)
-class SettledConfig(TrainConfig):
-    """TrainConfig whose protocol was followed: what it leaves automatic may be filled in."""
-
-    def _follow_protocol(self) -> None:
-        """Leaves the options as they are."""
-
-
-@dataclass(frozen=True)
-class RunConfig(SettledConfig):
+class RunConfig(TrainConfig):
     """TrainConfig with numbers in place of automatic values, as `train.plan` makes it."""
 
     iterations: int = option(2400, "Optimization steps.", minimum=1)

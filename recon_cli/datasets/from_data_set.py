@@ -1,4 +1,4 @@
-"""Frames of a data set with poses; `io.layouts` recognises it by its layout."""
+"""Frames of a data set with poses; `layouts` recognises it."""
 
 from __future__ import annotations
 

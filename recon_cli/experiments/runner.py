@@ -38,7 +38,7 @@ from recon_cli.train.fit.task import Task
 from recon_cli.train.parts.table import model_parts
 from recon_cli.train.plan import first_count
 from recon_cli.train.prune.prune_loop import RATIO, PruneRun, prune_loop, remaining, rounds_within
-from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.steps import StepFolder
 
 RECORDS_FILE = "runs.jsonl"

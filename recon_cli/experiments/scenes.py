@@ -12,12 +12,12 @@ from typing import Any
 
 from recon_cli.config.settings import Settings, build, merge
 from recon_cli.config.stages import ComputeConfig, IngestConfig, RunConfig, SfmConfig
-from recon_cli.context import StageContext, StageInputs
+from recon_cli.context import StageContext
 from recon_cli.datasets.layouts import recognise, refuse_incomplete
 from recon_cli.errors import ConfigError, Hint, InputError, ReconstructionError
 from recon_cli.evaluation.reference_views import load_reference_views
 from recon_cli.experiments.variants import TrainingRun
-from recon_cli.io.training_scene import held_out_names, load_scene
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.io.views import MASK_HINT, ReferenceView
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job, Target
@@ -28,7 +28,8 @@ from recon_cli.train.fit.task import Task
 from recon_cli.train.fit.train_data import load_task
 from recon_cli.train.parts.table import PARTS, model_parts
 from recon_cli.train.plan import choose_parts
-from recon_cli.workspace.digests import digest_file, sha256_json
+from recon_cli.workspace.digests import digest_file
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.layout import Workspace
 
 _READ = ("images", "denoised", "masks", "sparse")  # the inputs of training, below place/undistorted
@@ -36,21 +37,21 @@ _READ = ("images", "denoised", "masks", "sparse")  # the inputs of training, bel
 
 @dataclass(frozen=True, eq=False)
 class SceneFolders:
-    """The folders of ingest and place of a scene, and its name in tables and files."""
+    """The capture of a scene, and its name in tables and files."""
 
     name: str
-    inputs: StageInputs
+    capture: PlacedCapture
 
     @cached_property
     def digest(self) -> str:
         """Digest of the scene's images, masks, cameras and split, not of its name."""
-        undistorted = self.inputs.folders["place"] / "undistorted"
+        undistorted = self.capture.place / "undistorted"
         files = [path for part in _READ for path in sorted((undistorted / part).rglob("*"))
                  if path.is_file()]
         return sha256_json({
             "files": {str(path.relative_to(undistorted)): digest_file(path).sha256
                       for path in files},
-            "held_out": sorted(held_out_names(self.inputs.folders["ingest"]))})
+            "held_out": sorted(self.capture.frames.held_out)})
 
 
 def check_scenes(paths: Sequence[Path]) -> dict[str, Path]:
@@ -102,7 +103,7 @@ def open_scene(
         plan.run(Job(workspace, stages, compute, progress), "ingest and sfm", [
             Target("ingest", build(IngestConfig, stages), (path,)),
             *(Target(name, build(SfmConfig, stages)) for name in ("sfm", "place"))])
-    return SceneFolders(name, StageInputs({
+    return SceneFolders(name, PlacedCapture.read({
         stage: workspace.folder(stage) for stage in ("ingest", "place")}))
 
 
@@ -156,7 +157,7 @@ def load_for_training(
         ReconstructionError: no held-out view has a camera.
         ConfigError: there are no validation views, the views are too small, or masks leave none.
     """
-    scene = load_scene(folders.inputs.folders, validation=base.validation)
+    scene = folders.capture.load_scene(validation=base.validation)
     if split == "test" and not scene.test:
         raise ReconstructionError(
             f"No held-out view of {folders.name} has a camera.",

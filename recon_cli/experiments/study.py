@@ -49,7 +49,7 @@ from recon_cli.experiments.variants import (
 )
 from recon_cli.progress import Progress
 from recon_cli.workspace import atomic
-from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.layout import disk_errors, hold_lock, make_folder
 from recon_cli.workspace.steps import StepFolder
 

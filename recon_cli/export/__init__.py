@@ -1,1 +1,1 @@
-"""`recon import`: a scene that was made elsewhere, in a workspace of its own or with views."""
+"""What is done to a scene between training and its files, and to one that comes from a file."""

@@ -76,7 +76,10 @@ def _write_depth(
     unknown. Those are also the held-out ones: depth would reveal what they are scored on.
     """
     shutil.rmtree(out / _DEPTH, ignore_errors=True)
-    maps = read_depth_list(source.ingest) if source.in_metres else {}
+    if source.capture is None or not source.in_metres:
+        return None
+    ingest = source.capture.ingest
+    maps = read_depth_list(ingest)
     hidden = {view.name for view in source.scene.test}
     maps = {name: one for name, one in maps.items() if name not in hidden}
     if not any(name in maps for name, _ in cameras):
@@ -86,7 +89,7 @@ def _write_depth(
     for name, camera in cameras:
         depth = np.zeros((camera.height, camera.width))
         if name in maps:
-            depth = _as_seen(source.ingest, name, maps[name], camera) * source.scale
+            depth = _as_seen(ingest, name, maps[name], camera) * source.scale
         values = np.rint(depth / unit)
         write_png(out / _DEPTH / name, np.where(values > _MOST, 0, values).astype(np.uint16))
         paths[f"{_IMAGES}/{name}"] = f"{_DEPTH}/{name}"

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.config.export import ExportConfig
-from recon_cli.context import StageInputs
 from recon_cli.errors import ConfigError, StageError
-from recon_cli.io.colmap import read_images, read_pinholes, read_points
+from recon_cli.io.colmap import read_pinholes
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.room.measures import RoomFrame
 from recon_cli.room.scale import (
     ARBITRARY,
@@ -35,7 +35,6 @@ from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.statistics import ROUNDING
 from recon_cli.splats.axes import UP
 from recon_cli.workspace.export_formats import PLAN
-from recon_cli.workspace.records import ImportRecord, find_frames, has_views
 from recon_cli.workspace.summaries import WorldSummary
 
 logger = logging.getLogger("recon")
@@ -51,19 +50,23 @@ class ExportFrame:
     fused: FusedScale | None = None  # the scale by it and by all that sfm knew; None without it
 
 
-def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
+def choose_frame(
+    config: ExportConfig, capture: PlacedCapture | None, imported_up: NDArray[np.float64] | None
+) -> ExportFrame:
     """Returns the coordinate frame that the options select.
 
-    ConfigError if --scale-between does not name a place, or --transform is not a similarity.
+    Without a `capture`, up [3] is that of the imported scene. ConfigError if --scale-between does
+    not name a place, or --transform is not a similarity.
     """
-    measurement, fused = _measure_scale(config, inputs), None
-    similarity = Similarity()
-    if measurement is not None:
-        fused = fuse_measured(measurement.scale, measurement.error, _known_sources(
-            WorldSummary.read(inputs.folders["place"])))
+    measurement, fused, similarity = None, None, Similarity()
+    if capture is not None and config.scale_between is not None:
+        measurement = _measure_scale(config.scale_between, capture)
+        fused = fuse_measured(
+            measurement.scale, measurement.error, _known_sources(capture.world))
         assert fused.scale is not None  # what the user measured decides
         similarity = Similarity(scale=fused.scale)
-    up = _find_up(inputs, warn=config.up is not None)
+    up = imported_up if capture is None else _find_up(capture, warn=config.up is not None)
+    assert up is not None, "trained without views"
     if config.up is not None:
         similarity = Similarity(rotation=turn_onto(up, np.array(UP[config.up]))).after(similarity)
     if config.transform is not None:
@@ -78,9 +81,9 @@ def choose_frame(config: ExportConfig, inputs: StageInputs) -> ExportFrame:
     return ExportFrame(similarity, similarity.rotation @ up, measurement, fused)
 
 
-def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
+def find_room_frame(capture: PlacedCapture, frame: ExportFrame) -> RoomFrame:
     """Returns the frame for measures; StageError if scale or up is unknown: none is guessed."""
-    world = WorldSummary.read(inputs.folders["place"])
+    world = capture.world
     source = world.evidence.scale_source if world else ARBITRARY
     if frame.fused is None and source == ARBITRARY:
         raise StageError(
@@ -98,12 +101,9 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
         error = world.evidence.scale_error
     if world and world.evidence.scale_spread:  # where a length is, is not known
         error = float(np.hypot(error, world.evidence.scale_spread))
-    if world and world.evidence.up_found:
+    if capture.z_up:
         return RoomFrame(frame.similarity.rotation @ np.array(UP["z"]), error)
-    sparse = inputs.folders["place"] / "undistorted" / "sparse"
-    points, _ = read_points(sparse / "points3D.bin")
-    gravity = find_gravity(
-        points, np.stack([viewmat for _, _, viewmat in read_images(sparse / "images.bin")]))
+    gravity = find_gravity(capture.points, np.stack(list(capture.viewmats.values())))
     if gravity.up is None:
         raise StageError(
             f"{PLAN} cannot be measured: it is not known where up is, as {gravity.reason}.",
@@ -111,15 +111,10 @@ def find_room_frame(inputs: StageInputs, frame: ExportFrame) -> RoomFrame:
     return RoomFrame(frame.similarity.rotation @ gravity.up, error)
 
 
-def _measure_scale(config: ExportConfig, inputs: StageInputs) -> Measurement | None:
-    if config.scale_between is None:
-        return None
-    sparse = inputs.folders["place"] / "undistorted" / "sparse"
-    points, _ = read_points(sparse / "points3D.bin")
-    viewmats = {name: viewmat for name, _, viewmat in read_images(sparse / "images.bin")}
-    a, b = find_frames(inputs.folders["ingest"], config.scale_between[:2])
-    return measure(
-        ScaleBetween(a, b, config.scale_between[2]), points, viewmats, read_pinholes(sparse))
+def _measure_scale(between: tuple[str, str, float], capture: PlacedCapture) -> Measurement:
+    a, b = capture.frames.find(between[:2])
+    return measure(ScaleBetween(a, b, between[2]), capture.points, capture.viewmats,
+                   read_pinholes(capture.sparse))
 
 
 def _known_sources(world: WorldSummary | None) -> list[ScaleSource]:
@@ -138,16 +133,10 @@ def _known_sources(world: WorldSummary | None) -> list[ScaleSource]:
     return [ScaleSource(name[0], 1.0, name[1])] if name else []
 
 
-def _find_up(inputs: StageInputs, *, warn: bool) -> NDArray[np.float64]:
+def _find_up(capture: PlacedCapture, *, warn: bool) -> NDArray[np.float64]:
     """Returns up in the world of the training; `warn` says whether a guess is worth a warning."""
-    record = ImportRecord.read(inputs.folders["train"])
-    if record and not has_views(inputs.folders):
-        return record.up()
-    world = WorldSummary.read(inputs.folders["place"])
-    if world and world.evidence.up_found:
+    if capture.z_up:
         return np.array(UP["z"])
-    sparse = inputs.folders["place"] / "undistorted" / "sparse"
-    viewmats = np.stack([viewmat for _, _, viewmat in read_images(sparse / "images.bin")])
     if warn:
         logger.warning("up was not found, so --up uses the mean up of the cameras")
-    return camera_up(viewmats).up
+    return camera_up(np.stack(list(capture.viewmats.values()))).up

@@ -9,19 +9,17 @@ from __future__ import annotations
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from recon_cli.context import StageContext
-from recon_cli.errors import FormatError, Hint, ReconstructionError, name_command
+from recon_cli.errors import ReconstructionError, name_command
 from recon_cli.evaluation.metrics import psnr
 from recon_cli.evaluation.reference_views import load_reference_views, mean_psnr
 from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
-from recon_cli.workspace.summaries import WorldSummary
 
 SOURCE, WORKSPACE = "source", "workspace"
 _VIEWS = 6  # rendered in each frame, at most
@@ -57,20 +55,6 @@ class Alignment:
                           for name, value in self.psnr_db.items())
         return (f"{tried} on {self.views} training views; flat images in their mean colours get "
                 f"{self.flat_db:.1f} dB")
-
-
-def read_world(place: Path) -> Similarity:
-    """Returns the similarity from the world of the capture's cameras to that of the workspace.
-
-    `place` is the finished folder of the stage; FormatError if its record is damaged.
-    """
-    world = WorldSummary.read(place)
-    try:
-        return Similarity.from_json(world.similarity) if world else Similarity()
-    except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(
-            f"{place / WorldSummary.FILE} holds no similarity: {error}.",
-            hint=Hint("sfm", again=True)) from error
 
 
 def align_to_views(

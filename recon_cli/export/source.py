@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.config.stages import RunConfig
-from recon_cli.context import StageContext, StageInputs
+from recon_cli.context import StageContext
 from recon_cli.export.bounds import SIZE, VIEWS, Room, bound_scene
 from recon_cli.export.coordinate_frame import ExportFrame
 from recon_cli.export.page import make_guide
@@ -19,22 +17,16 @@ from recon_cli.export.synthetic_cameras import SelfPsnr, synthetic_scene
 from recon_cli.export.verify import ReferencePsnr, load_reference_psnr
 from recon_cli.io.images import fit_camera
 from recon_cli.io.sensor_depth import ALL_SAMPLES, read_sensor_depth
-from recon_cli.io.training_scene import load_scene
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.scene.train_view import TrainView
 from recon_cli.splats.format import Guide, WriteSettings
-from recon_cli.train.fit.train_data import load_views, read_config
-from recon_cli.workspace.records import (
-    POSES,
-    ImportRecord,
-    has_views,
-    read_frame_list,
-    read_poses,
-)
-from recon_cli.workspace.summaries import WorldSummary
+from recon_cli.train.finished_model import FinishedModel
+from recon_cli.train.fit.train_data import load_views
+from recon_cli.workspace.records import POSES, read_poses
 
 
 class ExportSource:
@@ -45,29 +37,30 @@ class ExportSource:
     """
 
     def __init__(
-        self, splats: Callable[[], Splats], inputs: StageInputs, frame: ExportFrame,
-        ctx: StageContext, *, antialiased: bool,
+        self, splats: Callable[[], Splats], trained: FinishedModel, capture: PlacedCapture | None,
+        frame: ExportFrame, ctx: StageContext, *, antialiased: bool,
     ) -> None:
-        self.frame, self.ctx, self.has_views = frame, ctx, has_views(inputs.folders)
-        self._splats, self._inputs, self._antialiased = splats, inputs, antialiased
+        self.frame, self.ctx, self.capture, self.has_views = (
+            frame, ctx, capture, capture is not None)
+        self._splats, self._trained, self._antialiased = splats, trained, antialiased
         self._similarity = frame.similarity  # from the world of the training to that of the files
 
     @cached_property
     def scene(self) -> Scene:
         """Views and points in the world of the training."""
-        if self.has_views:
-            return load_scene(self._inputs.folders, validation=self._run_config.validation)
-        record = ImportRecord.read(self._inputs.folders["train"])
+        config, record = self._trained.config, self._trained.import_record
+        if self.capture is not None:
+            return self.capture.load_scene(validation=config.validation)
         assert record is not None, "trained without views"
         imported = transformed(self._splats(), self._similarity.inverse())
-        return synthetic_scene(imported, up=record.up(), max_size=self._run_config.max_size)
+        return synthetic_scene(imported, up=record.up(), max_size=config.max_size)
 
     @cached_property
     def psnr(self) -> ReferencePsnr | SelfPsnr:
         """The measure of all files: on reference views, or against renders of the scene itself."""
         if self.has_views:
             return load_reference_psnr(
-                self.scene, self._similarity, self._run_config.max_size, self.ctx)
+                self.scene, self._similarity, self._trained.config.max_size, self.ctx)
         cameras = [camera for _, camera in self.place(self.scene.train)]
         psnr = SelfPsnr.from_renders(self._splats(), cameras, self.ctx)
         self.ctx.notice(f"no views: checked on {psnr.describe()}")
@@ -90,7 +83,7 @@ class ExportSource:
             for view in self._load_views()]
 
     def _load_views(self) -> list[ReferenceView]:
-        return load_views(self.scene.train, self._run_config, self.ctx)
+        return load_views(self.scene.train, self._trained.config, self.ctx)
 
     def load_photos(self, most_pixels: int) -> list[TrainView]:
         """Returns the training views as large as they are, or as `most_pixels` in all allow."""
@@ -98,7 +91,7 @@ class ExportSource:
         pixels = sum(view.camera.width * view.camera.height for view in views)
         longest = max(max(view.camera.width, view.camera.height) for view in views)
         size = max(int(longest * min(1.0, (most_pixels / pixels) ** 0.5)), 16)
-        config = dataclasses.replace(self._run_config, max_size=size)
+        config = dataclasses.replace(self._trained.config, max_size=size)
         return [dataclasses.replace(view, camera=self._similarity.camera(view.camera))
                 for view in load_views(views, config, self.ctx)]
 
@@ -120,25 +113,21 @@ class ExportSource:
     @cached_property
     def in_metres(self) -> bool:
         """Whether the capture came with metres, and the scene of the training is in metres."""
-        world, poses = WorldSummary.read(self._inputs.folders["place"]), self.ingest / POSES
-        return bool(world and world.evidence.metres and poses.exists()
-                    and read_poses(poses).metric)
+        if self.capture is None or self.capture.world is None:
+            return False
+        poses = self.capture.ingest / POSES
+        return (self.capture.world.evidence.metres and poses.exists()
+                and read_poses(poses).metric)
 
     @property
     def known_up(self) -> NDArray[np.float64] | None:
         """Up [3] in the world of the files, None where it is a guess."""
-        world = WorldSummary.read(self._inputs.folders["place"])
-        return self.frame.up if world and world.evidence.up_found else None
-
-    @property
-    def ingest(self) -> Path:
-        """The folder of ingest."""
-        return self._inputs.folders["ingest"]
+        return self.frame.up if self.capture is not None and self.capture.z_up else None
 
     def bound(self, splats: Splats) -> Splats:
         """Returns a scene of the files that reaches little farther than the room that views show.
         """
-        record = ImportRecord.read(self._inputs.folders["train"])
+        record = self._trained.import_record
         if not self.has_views or (record and record.doubt):  # its room is not known
             return splats
         cameras = np.stack([camera.center for _, camera in self.place(self.scene.train)])
@@ -155,11 +144,9 @@ class ExportSource:
     @cached_property
     def settings(self) -> WriteSettings:
         """Facts that a file can hold, without the options of its format."""
-        record = ImportRecord.read(self._inputs.folders["train"])
-        if record and not self.has_views:
-            title = record.file
-        else:
-            title = read_frame_list(self._inputs.folders["ingest"]).groups[0].name
+        record = self._trained.import_record
+        title = (self.capture.frames.groups[0].name if self.capture is not None else
+                 record.file if record is not None else "")
         return WriteSettings(
             up=self.frame.up, antialiased=self._antialiased, title=title,
             views=self.place(views_ahead(self.scene.train)), guide=self._guide)
@@ -169,7 +156,3 @@ class ExportSource:
             return None
         cameras = [camera for _, camera in self.place(views_ahead(self.scene.train))]
         return make_guide(splats, cameras, self.ctx)
-
-    @cached_property
-    def _run_config(self) -> RunConfig:
-        return read_config(self._inputs.folders["train"])

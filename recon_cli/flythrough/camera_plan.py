@@ -97,7 +97,7 @@ def _make_path(request: RenderRequest, trained: TrainedScene) -> CameraPath:
     usual = cameras[kinds.index(Counter(kinds).most_common(1)[0][0])]
     fov = np.degrees(2 * np.arctan(usual.height / 2 / usual.fy))
     # a tour is for people: as large as the frames, not as what was trained on
-    most = TOUR_SIZE if request.path == TOUR else trained.max_size
+    most = TOUR_SIZE if request.path == TOUR else trained.config.max_size
     width, height = fit_size(usual.width, usual.height, most)
     return CameraPath(viewmats, np.full(count, fov), width, height)
 
@@ -106,7 +106,7 @@ def _resize_view(camera: Camera, request: RenderRequest, trained: TrainedScene) 
     """Returns the camera of a view at the requested size, or at that of training and scores."""
     if request.size or request.width or request.height:
         return camera.resized(*frame_size(camera.width, camera.height, request))
-    return fit_camera(camera, trained.max_size)
+    return fit_camera(camera, trained.config.max_size)
 
 
 def _select_views(names: Sequence[str], scene: Scene) -> list[View]:

@@ -9,9 +9,7 @@ from recon_cli.errors import name_command
 from recon_cli.evaluation.reference_views import RenderedModel
 from recon_cli.flythrough.trained_scene import TrainedScene
 from recon_cli.pipeline.execute import Job
-from recon_cli.train.fit.train_data import read_config
 from recon_cli.trust.scene_trust import Trust, measure_trust, refuse_without, views_looked_at
-from recon_cli.workspace.records import ImportRecord
 
 logger = logging.getLogger("recon")
 
@@ -21,18 +19,17 @@ def load_trust(job: Job, trained: TrainedScene, ctx: StageContext) -> Trust:
 
     StageError for an imported scene without views, or whose views do not fit.
     """
-    folder = job.workspace.folder
-    refuse_without(ImportRecord.read(folder("train")))
-    trust = None
+    refuse_without(trained.imported)
+    trust, config = None, trained.config
     if job.inspect().check("evaluate").fresh:
-        trust = Trust.load(folder("evaluate"), trained.model, trained.digest, trained.sh_degree)
+        trust = Trust.load(job.workspace.folder("evaluate"), trained.model, trained.digest,
+                           config.sh_degree)
     splats = trained.splats.map(lambda tensor: tensor.to(ctx.device))
     if trust is None:
         logger.info(
             "trust is measured on the training views now; %s keeps it", name_command("eval"))
         with ctx.progress.bar("trust", views_looked_at(trained.scene), unit="view") as bar:
-            config = read_config(folder("train"))
             trust = measure_trust(
                 RenderedModel(splats, config.sh_degree, ctx.backend), trained.scene, config,
-                trained.max_size, ctx, bar.advance)
+                config.max_size, ctx, bar.advance)
     return Trust(trust.support.to(splats.means.device), trust.error, trust.sh_degree)

@@ -56,9 +56,8 @@ from recon_cli.workspace.atomic import (
     read_json,
     write_json,
 )
-from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.layout import HOLDER, LOCK, disk_errors
-from recon_cli.workspace.records import find_frames
 from recon_cli.workspace.steps import StepFolder
 
 RECORD = "render.json"
@@ -163,9 +162,8 @@ def render_frames(request: RenderRequest, job: Job) -> str:
     """
     with disk_errors(job.workspace.root, "reading the model"):
         trained = open_trained_scene(job, request.model)
-        if request.views:
-            request = replace(request, views=find_frames(
-                job.workspace.folder("ingest"), request.views))
+        if trained.frames is not None:
+            request = replace(request, views=trained.frames.find(request.views))
     plan = plan_cameras(request, trained)
     encoding = _check(request, plan)
     ctx = render_context(job.compute, job.progress)
@@ -242,7 +240,7 @@ def _frame_settings(
     cameras = plan.cameras
     return {
         **({"panorama": True} if request.panorama else {}),
-        "model": trained.model, "gaussians": trained.digest, "sh_degree": trained.sh_degree,
+        "model": trained.model, "gaussians": trained.digest, "sh_degree": trained.config.sh_degree,
         "outputs": list(request.outputs), "background": list(request.background or ()) or "own",
         "sizes": [list(size) for size in sorted(
             {(camera.width, camera.height) for camera in cameras.values()})],
@@ -266,7 +264,7 @@ def _render_missing(
     with torch.no_grad(), ctx.progress.bar(
             "render", total, unit="frame", done=total - len(missing)) as bar:
         for name in missing:
-            camera, degree = plan.cameras[name], trained.sh_degree
+            camera, degree = plan.cameras[name], trained.config.sh_degree
             output = draw(splats, camera, background, degree, backend=ctx.backend)
             for_depth = output if surfaces is splats else draw(
                 surfaces, camera, background, degree, backend=ctx.backend)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.scene.camera import Camera
 from recon_cli.scene.statistics import ROUNDING
+
+if TYPE_CHECKING:
+    from recon_cli.scene.camera import Camera
 
 _ROUNDING = 1e-4  # of a matrix in float32 or in decimals that somebody wrote
 

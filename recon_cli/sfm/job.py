@@ -56,7 +56,7 @@ class MappingJob(JsonRecord):
     out: Path  # the stage's folder
     groups: tuple[CameraGroup, ...]
     masks: Path | None  # folder of masks under the names of the frames; 0 is ignored
-    poses: Path | None  # file of known poses, see `io.posed`
+    poses: Path | None  # file of known poses, see `KnownPoses`
     pose_use: str
     given_points: bool  # the file of poses has points
     pairs: str
@@ -182,6 +182,7 @@ class PlaceJob(JsonRecord):
     part: int
     gravity: bool
     scale_between: tuple[str, str, float] | None
+    held_out: tuple[str, ...]  # names of the frames of which no point may come
     accept_weak: bool
     threads: int
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features.sphere import is_panorama
 
+Pair = tuple[str, str]  # file names of two images, in order
+
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """Returns the images of a model that have a camera, as COLMAP lists them."""

@@ -41,18 +41,18 @@ from recon_cli.workspace.summaries import (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stage:
     """One row: the needs of a stage and how it is run."""
 
     name: str  # its folder in the workspace and its section in recon.toml
     verb: str  # that the user types
-    needs: tuple[str, ...]  # stages that must be fresh before it starts
-    uses: tuple[str, ...]  # stages whose result is read if it is fresh and ignored otherwise
+    needs: tuple[str, ...] = ()  # stages that must be fresh before it starts
+    uses: tuple[str, ...] = ()  # stages whose result is read if it is fresh and ignored otherwise
     config: type[StageConfig]  # class of its options
     summary: type[JsonRecord]  # that run() returns
     version: int  # goes up when its output changes meaning; every older result is then stale
-    auto: bool  # it may be started because another stage needs it; training never is
+    auto: bool = False  # it may be started because another stage needs it; training never is
     module: str  # of its run()
     # patterns of outputs (times, logs, for resuming) that later stages' fingerprints leave out
     volatile: tuple[str, ...] = ()
@@ -94,42 +94,47 @@ def _format_stage(row: ExportFormat) -> Stage:
     """Returns the row of an exported format, which fits the .ply or, of cameras, its frame."""
     cameras = row.kind == "cameras"
     return Stage(
-        f"export.{row.name}", "export", ("ingest", "place", "train", "export"),
-        () if cameras else ("prune",), ExportConfig, ExportedFile, _EXPORT_VERSION, False,
-        "recon_cli.stages.export", renders=True, optional_when_imported=("ingest", "place"),
-        reads_other_versions=True, options=row.key_options,
-        reads={"train": (), "export": (TRANSFORM,)} if cameras else {})
+        name=f"export.{row.name}", verb="export", needs=("ingest", "place", "train", "export"),
+        uses=() if cameras else ("prune",), config=ExportConfig, summary=ExportedFile,
+        version=_EXPORT_VERSION, module="recon_cli.stages.export", renders=True,
+        optional_when_imported=("ingest", "place"), reads_other_versions=True,
+        options=row.key_options, reads={"train": (), "export": (TRANSFORM,)} if cameras else {})
 
 
 STAGES: tuple[Stage, ...] = (
-    Stage("ingest", "ingest", (), (), IngestConfig, IngestSummary, 6, False,
-          "recon_cli.stages.ingest", input_metavar="VIDEO"),
-    Stage("denoise", "denoise", ("ingest",), (), DenoiseConfig, DenoiseSummary, 4, True,
-          "recon_cli.stages.denoise"),
-    Stage("sfm", "sfm", ("ingest",), (), SfmConfig, SfmSummary, 5, True,
-          "recon_cli.stages.sfm",
-          ("database.db", "log.txt", "steps.json*", "segments.json"),
-          own_digests=True, options=tuple(
+    Stage(name="ingest", verb="ingest", config=IngestConfig, summary=IngestSummary, version=6,
+          module="recon_cli.stages.ingest", input_metavar="VIDEO"),
+    Stage(name="denoise", verb="denoise", needs=("ingest",), config=DenoiseConfig,
+          summary=DenoiseSummary, version=4, auto=True, module="recon_cli.stages.denoise"),
+    Stage(name="sfm", verb="sfm", needs=("ingest",), config=SfmConfig, summary=SfmSummary,
+          version=5, auto=True, module="recon_cli.stages.sfm", own_digests=True,
+          volatile=("database.db", "log.txt", "steps.json*", "segments.json"),
+          options=tuple(
               item.name for item in fields(SfmConfig) if item.name not in _PLACE_OPTIONS)),
-    Stage("place", "sfm", ("ingest", "denoise", "sfm"), (), SfmConfig, PlaceSummary, 1, True,
-          "recon_cli.stages.place", ("log.txt", "steps.json*", "verdict.json"), own_digests=True,
+    Stage(name="place", verb="sfm", needs=("ingest", "denoise", "sfm"), config=SfmConfig,
+          summary=PlaceSummary, version=1, auto=True, module="recon_cli.stages.place",
+          own_digests=True, volatile=("log.txt", "steps.json*", "verdict.json"),
           options=_PLACE_OPTIONS),
-    Stage("train", "train", ("ingest", "place"), (), TrainConfig, TrainSummary, 5, False,
-          "recon_cli.stages.train", ("log.jsonl", "plan.json"),
-          states=("mid.safetensors", "final.safetensors"), renders=True, edits="masks"),
-    Stage("prune", "prune", ("ingest", "place", "train"), (), PruneConfig, PruneSummary, 4, False,
-          "recon_cli.stages.prune", ("log.jsonl",), from_states=("train",), renders=True),
-    Stage("evaluate", "eval", ("ingest", "place", "train"), ("prune",), EvaluateConfig,
-          EvaluateSummary, 4, False, "recon_cli.stages.evaluate", renders=True,
-          reads_other_versions=True),
-    Stage("export", "export", ("ingest", "place", "train"), ("prune",), ExportConfig,
-          ExportSummary, _EXPORT_VERSION, False, "recon_cli.stages.export", renders=True,
+    Stage(name="train", verb="train", needs=("ingest", "place"), config=TrainConfig,
+          summary=TrainSummary, version=5, module="recon_cli.stages.train", renders=True,
+          volatile=("log.jsonl", "plan.json"), states=("mid.safetensors", "final.safetensors"),
+          edits="masks"),
+    Stage(name="prune", verb="prune", needs=("ingest", "place", "train"), config=PruneConfig,
+          summary=PruneSummary, version=4, module="recon_cli.stages.prune", renders=True,
+          volatile=("log.jsonl",), from_states=("train",)),
+    Stage(name="evaluate", verb="eval", needs=("ingest", "place", "train"), uses=("prune",),
+          config=EvaluateConfig, summary=EvaluateSummary, version=4,
+          module="recon_cli.stages.evaluate", renders=True, reads_other_versions=True),
+    Stage(name="export", verb="export", needs=("ingest", "place", "train"), uses=("prune",),
+          config=ExportConfig, summary=ExportSummary, version=_EXPORT_VERSION,
+          module="recon_cli.stages.export", renders=True,
           optional_when_imported=("ingest", "place"), reads_other_versions=True,
           options=_SCENE_OPTIONS,
           parts=tuple(map(_format_stage, list(EXPORT_FORMATS.values())[1:]))))
 
-IMPORT = Stage("train", "import", (), ("ingest", "place"), ImportConfig, ImportSummary, 1, False,
-               "recon_cli.stages.import_scene", renders=True, input_metavar="FILE")
+IMPORT = Stage(name="train", verb="import", uses=("ingest", "place"), config=ImportConfig,
+               summary=ImportSummary, version=1, module="recon_cli.stages.import_scene",
+               renders=True, input_metavar="FILE")
 
 
 def stage(name: str) -> Stage:

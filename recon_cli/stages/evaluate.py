@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.config.protocols import PROTOCOLS, SPLIT_WORDS
-from recon_cli.config.stages import EvaluateConfig, RunConfig
+from recon_cli.config.stages import EvaluateConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import list_names
 from recon_cli.evaluation.intervals import Interval, paired_bootstrap
@@ -54,21 +54,22 @@ from recon_cli.evaluation.scores import (
     view_table,
 )
 from recon_cli.io.images import to_uint8, write_png
-from recon_cli.io.training_scene import load_scene
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.io.views import ReferenceView, evenly_spread, size_summary, sizes_of
+from recon_cli.render.response import LensFalloffs
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.train_view import TrainView, leaves_enough
 from recon_cli.splats.ply import read_ply
-from recon_cli.train.fit.runner import LOG, seconds_at
-from recon_cli.train.fit.train_data import read_config
-from recon_cli.train.masks import read_summary, with_masks
+from recon_cli.train.finished_model import FinishedModel
+from recon_cli.train.fit.runner import seconds_at
+from recon_cli.train.masks import with_masks
 from recon_cli.train.parts.moving import FINER, ViewComparer, find_in_held_out
 from recon_cli.train.parts.part import SEARCH_SIDE
 from recon_cli.train.parts.photometry import read_falloffs
 from recon_cli.trust.assess import TrustTask, assess
 from recon_cli.workspace.atomic import write_json, write_text
-from recon_cli.workspace.records import Frame, ImportRecord, describe_stretches, read_frame_list
-from recon_cli.workspace.summaries import EvaluateSummary, WorldSummary
+from recon_cli.workspace.records import describe_stretches
+from recon_cli.workspace.summaries import EvaluateSummary, LogRow
 
 _SEEN_VIEWS = 20  # training and validation views that are also scored, at most
 _STAGES = {"base": "train", "pruned": "prune"}  # by model
@@ -80,10 +81,10 @@ class _Evaluation:
     """The models to score and the views."""
 
     out: Path
+    trained: FinishedModel
     folders: Mapping[str, Path]  # of train and prune, by model
-    config: RunConfig  # of the training
-    import_record: ImportRecord | None
-    frames: Sequence[Frame]  # all of ingest
+    falloffs: Mapping[str, LensFalloffs | None]  # the vignettes that each was trained with
+    capture: PlacedCapture
     scene: Scene
     held_out: Sequence[ReferenceView]
     training_views: Mapping[str, Sequence[ReferenceView]]  # some views of training, by split
@@ -95,13 +96,13 @@ class _Evaluation:
     @property
     def gains(self) -> bool:
         """Whether training had a gain for each view."""
-        return self.config.has_gains
+        return self.trained.config.has_gains
 
     def open(self, model: str, *, room: int) -> RenderedModel:
         """Reads one model; it keeps so many bytes of images that `score` renders."""
         splats = read_ply(self.folders[model] / "splats.ply")
         return RenderedModel(splats.map(lambda tensor: tensor.to(self.ctx.device)),
-                             self.config.sh_degree, self.ctx.backend, room)
+                             self.trained.config.sh_degree, self.ctx.backend, room)
 
     def score(
         self, model: str, rendered: RenderedModel, perceptual: Perceptual | None,
@@ -109,7 +110,7 @@ class _Evaluation:
     ) -> ModelMetrics:
         """Renders and scores one model, and saves its pictures."""
         splats, degree, backend = rendered.splats, rendered.sh_degree, rendered.backend
-        threads, falloffs = self.ctx.threads, read_falloffs(self.folders[model])
+        threads, falloffs = self.ctx.threads, self.falloffs[model]
 
         def seen(view: TrainView, images: Images) -> None:
             if falloffs is None:  # trust is that of the scene, without a lens
@@ -134,8 +135,8 @@ class _Evaluation:
             name: mean_psnr(splats, views, degree, backend, corrected=self.gains, threads=threads,
                             falloffs=falloffs, on_view=seen)
             for name, views in self.training_views.items()}
-        log = self.folders[model] / LOG
-        seconds = None if self.import_record else seconds_at(log, sys.maxsize)
+        log = self.folders[model] / LogRow.FILE
+        seconds = None if self.trained.import_record else seconds_at(log, sys.maxsize)
         return ModelMetrics.from_views(
             scores.views, gaussians=len(splats),
             bytes=(self.folders[model] / "splats.ply").stat().st_size,
@@ -162,13 +163,14 @@ class _Evaluation:
     def coverage(self) -> dict[str, Any]:
         """Returns how many frames there are and were trained on, and which have no camera."""
         scene = self.scene
+        frames = self.capture.frames.frames
         registered = {view.frame for view in (*scene.train, *scene.validation, *scene.test)}
         trained = {view.frame for view in scene.train}
         return {
-            "frames": len(self.frames),
-            "training_views": None if self.import_record else len(trained),
+            "frames": len(frames),
+            "training_views": None if self.trained.import_record else len(trained),
             "unregistered": tuple(
-                frame.name for frame in self.frames if frame.name not in registered)}
+                frame.name for frame in frames if frame.name not in registered)}
 
     def note(self, lacking: str) -> str:
         """Returns a note on the figures of the tables; `lacking` is why LPIPS is missing."""
@@ -184,12 +186,12 @@ class _Evaluation:
             note += f"Masks on {masked} of {len(self.held_out)} views: {MASK_CONVENTION}\n"
         if self.protocol:
             note += f"Protocol {self.protocol}: {PROTOCOLS[self.protocol].words}; {SPLIT_WORDS}\n"
-        if any(read_falloffs(folder) for folder in self.folders.values()):
+        if any(self.falloffs.values()):
             note += f"{VIGNETTE_CONVENTION}\n"
         if faces:
             note += f"{faces} of these views are {FACES_CONVENTION}\n"
         return note + "".join(
-            f"{text}\n" for text in (self.import_record.warnings() if self.import_record else ()))
+            f"{text}\n" for text in self.trained.warnings)
 
 
 def run(
@@ -197,6 +199,7 @@ def run(
 ) -> EvaluateSummary:
     """Renders and scores the held-out views and returns the means of each model."""
     evaluation = _load(config, inputs, out, ctx)
+    trained = evaluation.trained
     pictures = PanoramaPictures(evaluation.held_out)
     for view in evaluation.held_out:
         for name, _, photo, _ in pictures.take(view, view.image.astype(np.float32)):
@@ -212,9 +215,9 @@ def run(
     if unregistered:
         ctx.notice(f"{len(unregistered)} held-out views have no camera and are not scored: "
                    f"{', '.join(unregistered)}")
-    for text in evaluation.import_record.warnings() if evaluation.import_record else ():
+    for text in trained.warnings:
         ctx.notice(text)
-    _write(evaluation, models, inputs.folders["ingest"].parent.resolve().name, lacking)
+    _write(evaluation, models, evaluation.capture.ingest.parent.resolve().name, lacking)
     means = evaluation.counts()
     for name, model in models.items():
         for key in ("psnr_db", "ssim", "gaussians"):
@@ -222,16 +225,17 @@ def run(
         if evaluation.gains and model.gain_psnr_db is not None:
             means[f"{name}_gain_psnr_db"] = round(model.gain_psnr_db, 4)
     trust = assess(TrustTask(
-        name, rendered, evaluation.config, evaluation.scene, evaluation.held_out,
-        config.max_size or evaluation.config.max_size, evaluation.import_record,
-        WorldSummary.read(inputs.folders["place"])), out, ctx) if config.trust else None
+        name, rendered, trained.config, evaluation.scene, evaluation.held_out,
+        config.max_size or trained.config.max_size, trained.import_record,
+        evaluation.capture.world), out, ctx) if config.trust else None
     return EvaluateSummary(**means, poorly_seen=tuple(trust.lines()) if trust else None)
 
 
 def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> _Evaluation:
-    train_config = read_config(inputs.folders["train"])
-    scene = load_scene(inputs.folders, validation=train_config.validation)
-    size = config.max_size or train_config.max_size
+    trained, capture = (
+        FinishedModel.read(inputs.folders["train"]), PlacedCapture.read(inputs.folders))
+    scene = capture.load_scene(validation=trained.config.validation)
+    size = config.max_size or trained.config.max_size
     held_out = load_held_out_views(scene, size, ctx)
     splits = {"training": scene.train, "validation": scene.validation}
     training_views = {name: views for name, split in splits.items() if (
@@ -239,31 +243,28 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
             evenly_spread(split, _SEEN_VIEWS), size, threads=ctx.threads))}
     folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
-    record = ImportRecord.read(inputs.folders["train"])
-    followed = record is None and size == train_config.max_size
+    followed = trained.import_record is None and size == trained.config.max_size
     return _Evaluation(
-        out, folders, train_config, record,
-        read_frame_list(inputs.folders["ingest"]).frames, scene, held_out, training_views, ctx,
-        train_config.protocol if followed else None,
-        _find_moving(inputs.folders["train"], train_config, scene, held_out, ctx))
+        out, trained, folders, {model: read_falloffs(folder) for model, folder in folders.items()},
+        capture, scene, held_out, training_views, ctx,
+        trained.config.protocol if followed else None,
+        _find_moving(trained, scene, held_out, ctx))
 
 
 def _find_moving(
-    train: Path, config: RunConfig, scene: Scene, held_out: Sequence[ReferenceView],
-    ctx: StageContext,
+    trained: FinishedModel, scene: Scene, held_out: Sequence[ReferenceView], ctx: StageContext
 ) -> dict[str, NDArray[np.bool_]]:
     """Returns where held-out views show what moves, [H, W] by name, if training masked any.
 
     Faces of panoramas are scored together, and not looked at.
     """
-    summary = read_summary(train)
-    if summary is None or any(view.face_of for view in held_out):
+    if trained.moving is None or any(view.face_of for view in held_out):
         return {}
-    splats = read_ply(train / "splats.ply").map(lambda tensor: tensor.to(ctx.device))
+    splats = trained.read_splats().map(lambda tensor: tensor.to(ctx.device))
     training = load_reference_views(
-        with_masks(scene, train).train, FINER * SEARCH_SIDE, threads=ctx.threads)
+        with_masks(scene, trained.folder).train, FINER * SEARCH_SIDE, threads=ctx.threads)
     regions = find_in_held_out(
-        splats, held_out, training, ViewComparer(config.sh_degree, ctx.backend))
+        splats, held_out, training, ViewComparer(trained.config.sh_degree, ctx.backend))
     return {view.name: region for view, region in zip(held_out, regions, strict=True)
             if region.any() and leaves_enough(~region)}
 
@@ -291,6 +292,7 @@ def _write(
 ) -> None:
     """Writes the scores as JSON and as tables; `lacking` is why LPIPS cannot be measured."""
     out, held_out = evaluation.out, evaluation.held_out
+    record = evaluation.trained.import_record
     measured = next(iter(models.values())).lpips is not None
     lacking = "" if measured else lacking or "views with a mask have none"
     differences = {key: _difference(models, key) for key in ("psnr_db", "ssim")} if len(
@@ -304,9 +306,8 @@ def _write(
         mask_convention=MASK_CONVENTION if masked else None,
         truth_digest=reference_digest(held_out),
         **size_summary([view.camera for view in held_out]), **evaluation.counts(),
-        imported_from=evaluation.import_record.file if evaluation.import_record else None,
-        base_recipe=REFERENCE if evaluation.config.is_reference and not (
-            evaluation.import_record) else None,
+        imported_from=record.file if record else None,
+        base_recipe=REFERENCE if evaluation.trained.config.is_reference and not record else None,
         protocol=evaluation.protocol, **evaluation.coverage(),
         moving={name: round(float(region.mean()), 4) for name, region in sorted(
             evaluation.moving.items())} or None)
@@ -314,7 +315,8 @@ def _write(
     by_label = {metrics.label(name): model for name, model in models.items()}
     note = evaluation.note(lacking)
     if metrics.coverage:
-        stretches = describe_stretches(evaluation.frames, metrics.unregistered or ())
+        stretches = describe_stretches(
+            evaluation.capture.frames.frames, metrics.unregistered or ())
         note += f"{metrics.coverage}: {list_names(stretches)}\n"
     for label, model in by_label.items():
         note += f"{label}, {_gap(model)}\n"

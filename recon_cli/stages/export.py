@@ -23,17 +23,16 @@ from recon_cli.export.format_writer import FormatWriter, measure_first
 from recon_cli.export.reduce import ReducedScene, reduce_scene
 from recon_cli.export.source import ExportSource
 from recon_cli.export.verify import verify_ply
-from recon_cli.io.training_scene import load_scene
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.splats.axes import nearest_up
 from recon_cli.splats.ply import describe_scene, read_ply, write_ply
-from recon_cli.train.finished_model import FINAL
-from recon_cli.train.fit.train_data import read_config
+from recon_cli.train.finished_model import FinishedModel
 from recon_cli.trust.ply_property import PLY_PROPERTY, expected_errors, match_rows
 from recon_cli.trust.scene_trust import measure_trust, refuse_without, views_looked_at
 from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, PLAN, TRANSFORM
-from recon_cli.workspace.records import ImportRecord, has_views, need_views
+from recon_cli.workspace.records import ImportRecord, need_views
 from recon_cli.workspace.summaries import ExportedFile, ExportSummary
 
 _PLY = "splats.ply"
@@ -60,21 +59,28 @@ class _Export:
     """The scene of one export with its options, for all formats."""
 
     def __init__(self, config: ExportConfig, inputs: StageInputs, ctx: StageContext) -> None:
-        _refuse_without_views(config, inputs)
-        self._config, self._inputs = config, inputs
+        self._config, self._folders = config, inputs.folders
+        self._model = FinishedModel.read(inputs.folders["train"])
+        self._record = record = self._model.import_record
+        placed = {"ingest", "place"} <= inputs.folders.keys() and (record is None or record.views)
+        capture = PlacedCapture.read(inputs.folders) if placed else None
+        _refuse_without_views(config, record, has_views=placed)
         self._pruned = "prune" in inputs.folders and config.model != "base"
-        self._antialiased = not self._pruned and _is_antialiased(inputs.folders["train"])
-        self._frame = choose_frame(config, inputs)
+        self._antialiased = bool(
+            record and record.antialiased and not (self._pruned or self._model.trained))
+        self._frame = choose_frame(config, capture, record.up() if record else None)
         # refused before anything is written
-        room_frame = find_room_frame(inputs, self._frame) if PLAN in config.formats else None
+        room_frame = (find_room_frame(capture, self._frame)
+                      if capture is not None and PLAN in config.formats else None)
         self._source = ExportSource(
-            lambda: self._splats, inputs, self._frame, ctx, antialiased=self._antialiased)
+            lambda: self._splats, self._model, capture, self._frame, ctx,
+            antialiased=self._antialiased)
         self.writer = FormatWriter(lambda: self._reduced, config, self._source, room_frame)
 
     @cached_property
     def _trained(self) -> Splats:
         """The Gaussians in the world of the training."""
-        return read_ply(self._inputs.folders["prune" if self._pruned else "train"] / _PLY)
+        return read_ply(self._folders["prune" if self._pruned else "train"] / _PLY)
 
     @cached_property
     def _splats(self) -> Splats:
@@ -105,8 +111,8 @@ class _Export:
             bar.advance()
             verify_ply(path, splats)
             bar.advance()
-        record = ImportRecord.read(self._inputs.folders["train"])
-        _write_transform(out / TRANSFORM, frame, record.origin if record else None)
+        _write_transform(
+            out / TRANSFORM, frame, self._record.origin if self._record else None)
         return ExportSummary(
             model="pruned" if self._pruned else "base", file=path.name,
             gaussians=len(splats.with_sphere()), bytes=path.stat().st_size,
@@ -118,10 +124,8 @@ class _Export:
         """Returns the properties that --trust adds to the .ply of `splats`."""
         if not self._config.trust:
             return {}
-        folders, trained = self._inputs.folders, self._trained
-        refuse_without(ImportRecord.read(folders["train"]))
-        run_config = read_config(folders["train"])
-        scene = load_scene(folders, validation=run_config.validation)
+        refuse_without(self._record)
+        trained, run_config, scene = self._trained, self._model.config, self._source.scene
         with ctx.progress.bar("trust", views_looked_at(scene), unit="view") as bar:
             errors = expected_errors(trained, measure_trust(
                 RenderedModel(trained.map(lambda tensor: tensor.to(ctx.device)),
@@ -132,20 +136,15 @@ class _Export:
         return {PLY_PROPERTY: np.where(rows < 0, errors.max(), errors[rows])}
 
 
-def _is_antialiased(train: Path) -> bool:
-    """Returns whether a scene is that of an imported file that says so, and not trained here."""
-    record = ImportRecord.read(train)
-    return bool(record and record.antialiased) and not (train / FINAL).exists()
-
-
-def _refuse_without_views(config: ExportConfig, inputs: StageInputs) -> None:
+def _refuse_without_views(
+    config: ExportConfig, record: ImportRecord | None, *, has_views: bool
+) -> None:
     """Raises StageError if an option needs views, and an imported scene has none that fit."""
-    record = ImportRecord.read(inputs.folders["train"])
     if record and record.doubt and config.drop_floaters:
         raise StageError(
             f"--drop-floaters needs views of the scene, but {record.doubt}.",
             hint=Hint("import", then=" with another --frame, or from a file in the right one"))
-    if has_views(inputs.folders):
+    if has_views:
         return
     refused = [f"--format {name}" for name in config.formats if EXPORT_FORMATS[name].needs_views]
     if config.drop_floaters:

@@ -14,8 +14,8 @@ import numpy as np
 from recon_cli.config.stages import MIN_GAUSSIANS, ImportConfig, RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import FormatError, InputError
-from recon_cli.export.import_alignment import Alignment, align_to_views, read_world
-from recon_cli.io.training_scene import load_scene
+from recon_cli.export.import_alignment import Alignment, align_to_views
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splats import Splats, transformed
 from recon_cli.splats.axes import AXES
@@ -74,10 +74,10 @@ def _align(
     """
     if not {"ingest", "place"} <= inputs.folders.keys():
         return None
-    scene = load_scene(inputs.folders, validation=config.validation)
+    capture = PlacedCapture.read(inputs.folders)
     return align_to_views(
-        splats, scene, read_world(inputs.folders["place"]), config.frame, config.max_size, ctx,
-        moved=moved)
+        splats, capture.load_scene(validation=config.validation), capture.similarity,
+        config.frame, config.max_size, ctx, moved=moved)
 
 
 def _equivalent_run_config(config: ImportConfig, splats: Splats) -> RunConfig:

@@ -126,7 +126,7 @@ def _ingest(
     for path, _ in videos:
         _tell_foreign(path, ctx)
         refuse_unusable(path, config.camera)
-    scans = [from_video.scan(config, path, out / f"{prefix}{from_video.SCAN}", ctx)
+    scans = [from_video.load_or_scan(config, path, out / f"{prefix}{from_video.SCAN}", ctx)
              for path, prefix in videos]
     numbers = from_video.frame_counts(config, scans)
     _tell_many(config, sum(numbers), ctx)

@@ -44,8 +44,8 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         poses=ingest / POSES if found.poses else None,
         pose_use=found.poses.use if found.poses else "ignore", part=config.part,
         gravity=config.gravity == "auto", accept_weak=config.accept_weak, threads=ctx.threads,
-        scale_between=find_places(
-            ingest, config.scale_between, [frame.name for frame in frames.frames]))
+        scale_between=find_places(frames, config.scale_between),
+        held_out=tuple(sorted(frames.held_out)))
     store.refuse_missing_frames(job.frames, job.names, "ingest")
     store.refuse_missing_frames(job.denoised, job.names, "denoise")
     summary = _summary(frames, found, config.part, process.place_part(
@@ -70,13 +70,12 @@ def _summary(
 ) -> PlaceSummary:
     part = found.parts[number - 1]
     unregistered = tuple(sorted({frame.name for frame in frames.frames} - set(part.names)))
-    held_out = {frame.name for frame in frames.frames if frame.held_out}
     known = {item.name: getattr(record, item.name)
              for record in (found, placed) for item in fields(record)}
     return PlaceSummary(**{
         **known, "lines": (*found.broken[:1], *placed.lines, *found.notes)},
         registered=len(part.names), rejected=part.rejected, unregistered=unregistered,
-        unregistered_held_out=tuple(name for name in unregistered if name in held_out),
+        unregistered_held_out=tuple(name for name in unregistered if name in frames.held_out),
         part=number if len(found.parts) > 1 else None)
 
 

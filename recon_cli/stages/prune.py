@@ -14,11 +14,11 @@ from recon_cli.errors import ConfigError, Hint, TrainingError
 from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import max_gaussians, write_ply
 from recon_cli.train.fit.loop import validation_psnr
-from recon_cli.train.fit.runner import LOG, seconds_at
+from recon_cli.train.fit.runner import seconds_at
 from recon_cli.train.parts.photometry import write_photometry
 from recon_cli.train.prune.prune_loop import RATIO, prune_loop, remaining
 from recon_cli.train.prune.prune_run import StoredPruneRun, load_prune_source, prune_while_good
-from recon_cli.workspace.summaries import PruneSummary, RoundSummary
+from recon_cli.workspace.summaries import LogRow, PruneSummary, RoundSummary
 
 
 def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> PruneSummary:
@@ -57,7 +57,7 @@ def run(config: PruneConfig, inputs: StageInputs, out: Path, ctx: StageContext) 
         iterations=state.steps, recovery_steps=state.steps - steps,
         validation_psnr_db_before=psnr_before,
         validation_psnr_db=validation_psnr(state, source.task),
-        train_seconds=seconds_at(out / LOG, state.iteration))
+        train_seconds=seconds_at(out / LogRow.FILE, state.iteration))
 
 
 def _target(config: PruneConfig, splats: Splats) -> int:

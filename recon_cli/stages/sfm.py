@@ -61,7 +61,7 @@ def run(config: SfmConfig, inputs: StageInputs, out: Path, ctx: StageContext) ->
         times=_times(frames, tracks),
         spare_minutes=max(0.0, ctx.deadline.left / 60) if ctx.deadline.limited else None)
     store.refuse_missing_frames(job.frames, job.names, "ingest")
-    find_places(ingest, config.scale_between, job.names)  # now, not after minutes of mapping
+    find_places(frames, config.scale_between)  # now, not after minutes of mapping
     _tell_time(config, job, ctx)
     runs = _run_segments(config, job, ctx)
     job = runs.job

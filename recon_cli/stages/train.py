@@ -13,10 +13,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from recon_cli.config.protocols import SPLIT_WORDS
-from recon_cli.config.stages import SettledConfig, TrainConfig
+from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError, format_count, list_names, name_command
-from recon_cli.io.training_scene import load_scene
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.scene.scene import Scene
 from recon_cli.train.blocks import blocks
 from recon_cli.train.blocks.merge_blocks import merge_blocks
@@ -30,7 +30,7 @@ from recon_cli.train.masks import (
     write_masks,
 )
 from recon_cli.train.one_model import fit_scene
-from recon_cli.workspace.records import Frame, read_frame_list
+from recon_cli.workspace.records import Frame
 from recon_cli.workspace.summaries import TrainSummary
 
 EVERY = 8  # views from one that is held out to the next, sorted by name, the first one included
@@ -39,8 +39,9 @@ MAX_WIDTH = 1600  # pixels; INRIA's code reduces wider images to it
 
 def run(config: TrainConfig, inputs: StageInputs, out: Path, ctx: StageContext) -> TrainSummary:
     """Fits Gaussians to the training views and returns how far it came."""
-    scene = load_scene(inputs.folders, validation=config.validation)
-    config = fit_protocol(config, scene, read_frame_list(inputs.folders["ingest"]).frames)
+    capture = PlacedCapture.read(inputs.folders)
+    scene = capture.load_scene(validation=config.validation)
+    config = fit_protocol(config, scene, capture.frames.frames)
     model = None if inputs.continues is None else FinishedModel.read(inputs.continues)
     if model is not None and config.protocol is not None:
         raise ConfigError(
@@ -101,8 +102,7 @@ def fit_protocol(config: TrainConfig, scene: Scene, frames: Iterable[Frame]) -> 
         return config
     _check_split(config.protocol, frames)
     size = image_size(scene) if config.max_size is None else config.max_size
-    values = {item.name: getattr(config, item.name) for item in dataclasses.fields(config)}
-    return SettledConfig(**{**values, "max_size": size})
+    return dataclasses.replace(config.settle(), max_size=size)
 
 
 def image_size(scene: Scene) -> int:

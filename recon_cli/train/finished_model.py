@@ -1,4 +1,4 @@
-"""The finished model that a training continues: of a shorter run, or an imported scene.
+"""A finished model in its folder: scored, pruned, exported, or continued by a longer training.
 
 A continued run takes steps of their own after the end of that model (`ContinuedSchedule`), and
 keeps the parts of it: no trial is repeated. What is known of an imported scene stays with the
@@ -11,24 +11,26 @@ import dataclasses
 import json
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, name_command
-from recon_cli.scene.splats import with_rows
+from recon_cli.scene.splats import Splats, with_rows
 from recon_cli.splats.ply import read_ply
 from recon_cli.train.fit.initialize import begin_state, restore_state
-from recon_cli.train.fit.runner import LOG
 from recon_cli.train.fit.schedule import Schedule
 from recon_cli.train.fit.state import DensificationStats, TrainState, read_progress
 from recon_cli.train.fit.task import Task
 from recon_cli.train.fit.train_data import read_config
+from recon_cli.train.masks import read_summary
 from recon_cli.train.parts.table import PARTS, model_parts
 from recon_cli.workspace.atomic import write_bytes
+from recon_cli.workspace.manifest import SCENE
 from recon_cli.workspace.records import ImportRecord
-from recon_cli.workspace.summaries import LogRow, TrainPlan, TrialDecision
+from recon_cli.workspace.summaries import LogRow, MovingSummary, TrainPlan
 
 FINAL = "final.safetensors"
 _FEW = 0.1  # of the steps before; fewer do not make good what the rates lose that start anew
@@ -37,35 +39,59 @@ _FEW = 0.1  # of the steps before; fewer do not make good what the rates lose th
 logger = logging.getLogger("recon")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FinishedModel:
-    """A finished model in its folder."""
+    """A model as train, or import, left it. What is not read at once is read once, when asked for.
+
+    FormatError is raised by all that reads a file that is damaged or of another version.
+    """
 
     folder: Path
     config: RunConfig  # options of its run
     import_record: ImportRecord | None  # of the scene that the first run began with, if any
-    steps: int  # taken so far, not counting those of another program
-    gaussians: int  # count
-    decisions: tuple[TrialDecision, ...]  # of its trials
 
     @staticmethod
     def read(folder: Path) -> FinishedModel:
-        """Returns the model in a finished folder of train or import.
+        """Returns the model in a finished folder of train or import."""
+        return FinishedModel(folder, read_config(folder), ImportRecord.read(folder))
 
-        Raises:
-            FormatError: a file in it is damaged or of another version.
-        """
-        final = folder / FINAL
-        steps, gaussians = read_progress(final) if final.exists() else (
-            0, len(read_ply(folder / "splats.ply")))
-        return FinishedModel(
-            folder, read_config(folder), ImportRecord.read(folder), steps, gaussians,
-            TrainPlan.read(folder).needs if (folder / TrainPlan.FILE).exists() else ())
+    @property
+    def warnings(self) -> list[str]:
+        """The caveats of every score, where its first run began with an imported scene."""
+        return self.import_record.warnings() if self.import_record else []
 
     @property
     def trained(self) -> bool:
-        """Whether it was trained here, at least at last."""
-        return self.steps > 0
+        """Whether it was trained here as one model, at least at last."""
+        return (self.folder / FINAL).exists()
+
+    @cached_property
+    def _progress(self) -> tuple[int, int]:
+        return read_progress(self.folder / FINAL) if self.trained else (0, len(self.read_splats()))
+
+    @property
+    def steps(self) -> int:
+        """Steps taken so far, not counting those of another program."""
+        return self._progress[0]
+
+    @property
+    def gaussians(self) -> int:
+        """Count."""
+        return self._progress[1]
+
+    @cached_property
+    def plan(self) -> TrainPlan | None:
+        """The decisions before its first step; None where it was not planned here."""
+        return TrainPlan.read(self.folder) if (self.folder / TrainPlan.FILE).exists() else None
+
+    @cached_property
+    def moving(self) -> MovingSummary | None:
+        """What its training masked; None where it masked nothing."""
+        return read_summary(self.folder)
+
+    def read_splats(self) -> Splats:
+        """Returns its Gaussians."""
+        return read_ply(self.folder / SCENE)
 
     def choose_parts(self, asked: TrainConfig) -> dict[str, Any]:
         """Returns the parts of the continued model, by the names of their options.
@@ -98,7 +124,7 @@ class FinishedModel:
             if schedule.steps < _FEW * self.steps:
                 ctx.notice(f"{schedule.steps:,} more steps than {self.steps:,} are too few to gain "
                            "anything: learning rates start anew")
-            write_bytes(out / LOG, _renumbered(LogRow.read_all(self.folder / LOG)))
+            write_bytes(out / LogRow.FILE, _renumbered(LogRow.read_all(self.folder / LogRow.FILE)))
         record = self.import_record
         if record is None:
             return
@@ -116,7 +142,7 @@ class FinishedModel:
         """
         config = task.schedule.config
         if not self.trained:
-            splats = read_ply(self.folder / "splats.ply").with_degree(config.sh_degree)
+            splats = self.read_splats().with_degree(config.sh_degree)
             splats.sh_rest = with_rows(splats.sh_rest, len(splats))  # each may get harmonics
             return begin_state(splats, task)
         state = restore_state(self.folder / FINAL, task)

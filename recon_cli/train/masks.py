@@ -151,10 +151,9 @@ def read_summary(folder: Path) -> MovingSummary | None:
         raise FormatError(f"{path} is damaged: {error.message}", hint=hint) from error
 
 
-def copy_masks(folder: Path, out: Path) -> None:
+def copy_masks(folder: Path, summary: MovingSummary | None, out: Path) -> None:
     """Copies the masks of a finished training and their record to that which continues it."""
     _remove_masks(out)
-    summary = read_summary(folder)
     if summary is None:
         return
     for path in sorted((folder / FOLDER).glob("*.png")):

@@ -12,7 +12,7 @@ from recon_cli.io.views import size_summary
 from recon_cli.scene.scene import Scene
 from recon_cli.splats.ply import write_ply
 from recon_cli.train.finished_model import FinishedModel
-from recon_cli.train.fit.runner import CHECKPOINT, LOG, RunSegment, run_fit
+from recon_cli.train.fit.runner import CHECKPOINT, RunSegment, run_fit
 from recon_cli.train.fit.state import TrainState, save_state
 from recon_cli.train.fit.task import Task
 from recon_cli.train.masks import EditedMasks, read_summary
@@ -21,7 +21,7 @@ from recon_cli.train.parts.table import model_parts
 from recon_cli.train.plan import first_or_saved, plan_task
 from recon_cli.workspace.atomic import delete
 from recon_cli.workspace.records import ImportRecord
-from recon_cli.workspace.summaries import LogRow, PhotometrySummary, TrainPlan, TrainSummary
+from recon_cli.workspace.summaries import LogRow, TrainPlan, TrainSummary
 
 
 def fit_scene(
@@ -45,12 +45,14 @@ def fit_scene(
     write_ply(out / "splats.ply", state.splats)
     write_photometry(out, state.photometry)
     delete(out / CHECKPOINT)
-    return _summarize(state, task, out, ctx)
+    return _summarize(state, task, out, ctx, model.import_record if model else None)
 
 
-def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> TrainSummary:
-    config, plan, last = task.schedule.config, TrainPlan.read(out), LogRow.read_all(out / LOG)[-1]
-    import_record = ImportRecord.read(out)
+def _summarize(
+    state: TrainState, task: Task, out: Path, ctx: StageContext, import_record: ImportRecord | None
+) -> TrainSummary:
+    config, plan = task.schedule.config, TrainPlan.read(out)
+    last = LogRow.read_all(out / LogRow.FILE)[-1]
     return TrainSummary(
         imported_from=import_record.file if import_record else None,
         continued_from_step=plan.continues_at or None,
@@ -64,4 +66,5 @@ def _summarize(state: TrainState, task: Task, out: Path, ctx: StageContext) -> T
         parts=model_parts(config), skipped_steps=state.skipped, estimated_seconds=plan.seconds,
         calibration_seconds=round(plan.cost["seconds"], 3),
         cuda_peak_bytes=torch.cuda.max_memory_allocated() if ctx.device == "cuda" else 0,
-        moving=read_summary(out), photometry=PhotometrySummary.read(out))
+        moving=read_summary(out),
+        photometry=state.photometry.summarize() if state.photometry else None)

@@ -243,7 +243,7 @@ def plan_task(
     given, edited, deadline = scene, edited or EditedMasks(), Deadline(seconds)
     planned = (out / TrainPlan.FILE).exists()
     if not planned and model is not None:
-        copy_masks(model.folder, out)
+        copy_masks(model.folder, model.moving, out)
     elif not planned:
         write_masks(out, scene, None, edited)
     scene = with_masks(scene, out)
@@ -260,7 +260,7 @@ def plan_task(
     fit_memory = gaussians_that_fit(scene, first, ctx)
     task = load_task(scene, first, ctx)
     extras = deadline.part(EXTRAS_SHARE)
-    needs = Needs(first, model.decisions) if model is not None else choose_parts(
+    needs = Needs(first, model.plan.needs if model.plan else ()) if model else choose_parts(
         task, scene, ctx, harmonics=config.sh_degree is None, deadline=deadline.part(TRIALS_SHARE))
     if needs.config.images == "denoised" and first.images != "denoised":
         task = load_task(scene, dataclasses.replace(first, images="denoised"), ctx)

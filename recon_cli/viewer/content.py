@@ -104,7 +104,7 @@ def load_workspace(job: Job, model: str) -> ViewerContent:
     distance = float(np.median(depths)) if len(depths) else scene.extent
     return ViewerContent(
         models, views, trained.up(), browser_camera(first, distance, _far_plane(models)), distance,
-        trained.max_size, _find_title(job), PathFolder(
+        trained.config.max_size, _find_title(job), PathFolder(
             job.workspace.root, job.workspace.root, fit_size(first.width, first.height, TOUR_SIZE)),
         trained.metres, _describe_masked(job))
 

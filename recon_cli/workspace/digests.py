@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from recon_cli.errors import InputError
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.paths import refuse_special
 
 
@@ -36,12 +35,6 @@ class Source:
         if len(self.files) == 1:
             return [file.sha256 for file in self.files.values()]
         return [f"{name} {file.sha256}" for name, file in self.files.items()]
-
-
-def sha256_json(value: Any) -> str:
-    """Returns the SHA-256 of a JSON value, with its keys in any order."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def digest_file(path: Path, known: FileDigest | None = None) -> FileDigest:

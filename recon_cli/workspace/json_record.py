@@ -7,6 +7,8 @@ another key says so: `field(metadata={KEY: "key"})`.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import types
 import typing
 from collections.abc import Mapping
@@ -115,3 +117,9 @@ def _decode(name: str, kind: Any, item: Any) -> Any:
     raise ManifestError(
         f"the record holds {repr(item)[:100]} as {name}: another version of recon wrote it",
         hint=_HINT)
+
+
+def sha256_json(value: Any) -> str:
+    """Returns the SHA-256 of a JSON value, with its keys in any order."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -57,6 +57,7 @@ class Workspace:
 
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
+        self._manifests: dict[Path, tuple[os.stat_result, Manifest]] = {}  # as they were read
 
     @property
     def holds_results(self) -> bool:
@@ -64,13 +65,11 @@ class Workspace:
         return (self.root / "ingest" / "manifest.json").is_file()
 
     def folder(self, stage: str) -> Path:
-        """Returns where a stage's finished result lies or will lie.
-
-        That of `place` lies in sfm/ where sfm has made the views, as an earlier version did.
-        """
+        """Returns where a stage's finished result lies or will lie; an earlier sfm made views."""
         own, sfm = self._target(stage), self._target("sfm")
-        earlier = stage == "place" and not os.path.lexists(own) and (sfm / "undistorted").is_dir()
-        return sfm if earlier else own
+        if stage == "place" and not os.path.lexists(own) and (sfm / "undistorted").is_dir():
+            return sfm
+        return own
 
     def _target(self, stage: str) -> Path:
         """Returns where a stage's next result will lie."""
@@ -124,8 +123,19 @@ class Workspace:
         folder, name = self.folder(stage), manifest_name(stage)
         if not _has_manifest(folder, name):
             return None
-        manifest = Manifest.read(folder, name)
+        manifest = self._read_manifest(folder, name)
         return manifest if manifest.key.stage != "sfm" or stage == "sfm" else manifest.as_place()
+
+    def _read_manifest(self, folder: Path, name: str) -> Manifest:
+        """Returns a manifest, which is read again once its file is another one."""
+        known = self._manifests.get(folder / name)
+        try:
+            now = (folder / name).stat()
+        except OSError:  # which is said by whoever reads it
+            return Manifest.read(folder, name)
+        if known is None or not _is_same(known[0], now):
+            known = self._manifests[folder / name] = now, Manifest.read(folder, name)
+        return known[1]
 
     def partial_run(self, stage: str) -> PartialRun | None:
         """Returns how far an interrupted run of a stage came, or None."""
@@ -371,6 +381,12 @@ def _is_in_use(leftover: Path) -> bool:
     return number is not None and psutil.pid_exists(int(number[1]))
 
 
+def _is_same(before: os.stat_result, now: os.stat_result) -> bool:
+    """Returns whether a file is the one of before: replaced ones are files of their own."""
+    return all(getattr(before, sign) == getattr(now, sign)
+               for sign in ("st_ino", "st_size", "st_mtime_ns"))
+
+
 def _has_manifest(folder: Path, name: str = manifest.NAME) -> bool:
     """Returns whether a folder has a manifest, be it a link that leads nowhere.
 
@@ -466,10 +482,7 @@ def hold_lock(root: Path, verb: str, *, other: str = "another workspace with -w"
 
 
 def _name_holder(path: Path, verb: str) -> None:
-    """Writes who holds the lock. Only the lock counts, so a full disk does not matter here.
-
-    Nor does half a file of a process that was killed: the next one writes another.
-    """
+    """Writes who holds the lock; only the lock counts, so a full disk or a kill does not matter."""
     with suppress(OSError):
         remove(path)
         path.write_text(json.dumps({

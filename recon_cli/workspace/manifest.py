@@ -18,9 +18,8 @@ from recon_cli.workspace.digests import (
     digest_file,
     digest_outputs,
     matches,
-    sha256_json,
 )
-from recon_cli.workspace.json_record import KEY, JsonRecord
+from recon_cli.workspace.json_record import KEY, JsonRecord, sha256_json
 
 NAME = "manifest.json"
 SCENE = "splats.ply"  # in the results of train and prune

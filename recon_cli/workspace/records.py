@@ -93,6 +93,21 @@ class FrameList(JsonRecord):
                 del frame["exposure_ev"]
         atomic.write_json(stage / LIST, value)
 
+    @property
+    def held_out(self) -> frozenset[str]:
+        """The names of the frames that are held out for the score."""
+        return frozenset(frame.name for frame in self.frames if frame.held_out)
+
+    def find(self, words: Sequence[str]) -> tuple[str, ...]:
+        """Returns words in which a photo, alone or before ":u,v", is called as its frame."""
+        frames = {photo: name for name, photo in list_photos(self.frames).items()}
+
+        def find(word: str) -> str:
+            front, colon, pixel = word.partition(":")
+            return frames.get(word) or f"{frames.get(front, front)}{colon}{pixel}"
+
+        return tuple(map(find, words))
+
 
 def read_frame_list(stage: Path) -> FrameList:
     """Returns the list of frames in ingest's folder; FormatError if it is missing or damaged."""
@@ -145,22 +160,6 @@ def refuse_missing_frames(folder: Path, names: Collection[str], verb: str) -> No
         raise FormatError(
             f"{folder} lacks {len(missing)} of {len(names)} frames: {list_names(missing)}.",
             hint=Hint(verb, again=True))
-
-
-def find_frames(ingest: Path, words: Sequence[str]) -> tuple[str, ...]:
-    """Returns words in which a photo, alone or before ":u,v", is called as its frame.
-
-    FormatError if the list of frames in the folder is damaged.
-    """
-    if not ingest.is_dir():  # of an imported scene
-        return tuple(words)
-    frames = {photo: name for name, photo in list_photos(read_frame_list(ingest).frames).items()}
-
-    def find(word: str) -> str:
-        front, colon, pixel = word.partition(":")
-        return frames.get(word) or f"{frames.get(front, front)}{colon}{pixel}"
-
-    return tuple(map(find, words))
 
 
 def describe_stretches(frames: Sequence[Frame], names: Collection[str]) -> list[str]:
@@ -311,8 +310,3 @@ class ImportRecord(JsonRecord):
         path = folder / _IMPORT
         return ImportRecord.from_json(atomic.read_json(path, dict)) if path.exists() else None
 
-
-def has_views(folders: Mapping[str, Path]) -> bool:
-    """Returns whether views were trained on or compared with; `folders` are by stage name."""
-    record = ImportRecord.read(folders["train"])
-    return (record is None or record.views) and "place" in folders

@@ -24,8 +24,7 @@ from typing import Any, TypeVar
 
 from recon_cli.errors import ManifestError
 from recon_cli.workspace import durable
-from recon_cli.workspace.digests import sha256_json
-from recon_cli.workspace.json_record import JsonRecord
+from recon_cli.workspace.json_record import JsonRecord, sha256_json
 from recon_cli.workspace.paths import is_plain_file
 
 PARTIAL = ".partial"  # the folder of unfinished work in a workspace

@@ -252,6 +252,8 @@ class TrainPlan(JsonRecord):
 class LogRow(JsonRecord):
     """One line of log.jsonl; None where it holds no such value."""
 
+    FILE: typing.ClassVar[str] = "log.jsonl"
+
     iteration: int
     seconds: float  # of training from its start
     cpu_seconds: float = 0.0

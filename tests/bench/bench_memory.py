@@ -29,6 +29,7 @@ from workbench import (
 from recon_cli import machine
 from recon_cli.config.stages import TrainConfig
 from recon_cli.context import StageInputs
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.scene.scene import Scene
 from recon_cli.stages import train
 
@@ -77,7 +78,7 @@ def main(
     ctx = dataclasses.replace(
         numba_context(2), max_memory_bytes=int(max_memory * 1e9), scratch=child)
     with (tempfile.TemporaryDirectory(dir=child) as out, machine.Meter() as meter,
-          patch.object(train, "load_scene", lambda *_, **__: scene)):
+          patch.object(PlacedCapture, "load_scene", lambda *_, **__: scene)):
         train.run(config, StageInputs(stage_folders(workspace)), Path(out), ctx)
     label = "in memory" if max_memory >= 1e6 else f"in a file, --max-memory {max_memory:g}"
     print_row(label, f"{meter.peak_memory_bytes / 1e9:.2f}", f"{meter.seconds:.0f}")

@@ -24,7 +24,7 @@ from workbench import numba_context, open_trained, print_head, print_row, worksp
 from recon_cli.evaluation.reference_views import RenderedModel, load_reference_views
 from recon_cli.io.views import ReferenceView
 from recon_cli.machine import usable_threads
-from recon_cli.train.fit.runner import LOG, seconds_at
+from recon_cli.train.fit.runner import seconds_at
 from recon_cli.trust.agreement import ause
 from recon_cli.trust.error_model import picture_terms
 from recon_cli.trust.scene_trust import Trust, measure_trust, model_trust
@@ -65,7 +65,7 @@ def main(workspaces: Sequence[Path]) -> None:
         row = model_trust(trust, model, surface, views, gains=config.exposure == "on")
         agreement, (low, high) = row.agreement, bounds(model, trust, views)
         assert agreement is not None
-        trained = seconds_at(workspace / "train" / LOG, 1 << 62, clock="cpu_seconds")
+        trained = seconds_at(workspace / "train" / 1 << 62, clock="cpu_seconds")
         areas = (agreement.ause, agreement.ause_opacity, agreement.ause_depth, low, high)
         print_row(
             workspace.name, str(agreement.views), *(f"{area:.3f}" for area in areas),

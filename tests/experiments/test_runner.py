@@ -24,6 +24,7 @@ from recon_cli.experiments.scenes import (
     load_for_training,
 )
 from recon_cli.experiments.variants import BUDGET, PAPER, REFERENCE, TrainingRun
+from recon_cli.io.training_scene import PlacedCapture
 
 BASE = RunConfig(iterations=1, max_size=48, max_gaussians=90, densify_every=10, validation=0.2)
 
@@ -34,7 +35,7 @@ def nothing() -> None:
 
 @pytest.fixture
 def tiny(tmp_path: Path) -> ExperimentScene:
-    place = SceneFolders("tiny", make_inputs(tmp_path))
+    place = SceneFolders("tiny", PlacedCapture.read(make_inputs(tmp_path).folders))
     return load_for_training(place, "validation", BASE, StageContext(backend="numba"))
 
 
@@ -90,12 +91,12 @@ def test_a_run_trains_on_no_view_that_is_scored(tiny: ExperimentScene) -> None:
 # ---- scenes ----
 
 def test_a_digest_is_of_what_a_scene_holds(tmp_path: Path) -> None:
-    one = SceneFolders("one", make_inputs(tmp_path / "a"))
-    two = SceneFolders("two", make_inputs(tmp_path / "b"))
+    one = SceneFolders("one", PlacedCapture.read(make_inputs(tmp_path / "a").folders))
+    two = SceneFolders("two", PlacedCapture.read(make_inputs(tmp_path / "b").folders))
     assert one.digest == two.digest
     image = tmp_path / "b" / "place" / "undistorted" / "denoised" / "000003.png"
     image.write_bytes(image.read_bytes() + b"\0")
-    assert SceneFolders("two", two.inputs).digest != one.digest
+    assert SceneFolders("two", two.capture).digest != one.digest
 
 
 def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from recon_cli.experiments.study import (
     equal_seconds,
 )
 from recon_cli.experiments.variants import TrainingRun
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.progress import NullProgress
 
 STEPS = 20
@@ -43,7 +44,7 @@ COSTS = {"reference": 0.5, "paper": 0.4, "budget": 0.25, "budget-pruned": 0.2}  
 
 @pytest.fixture
 def scene(tmp_path):
-    folders = SceneFolders("tiny", make_inputs(tmp_path / "tiny"))
+    folders = SceneFolders("tiny", PlacedCapture.read(make_inputs(tmp_path / "tiny").folders))
     return load_for_training(folders, "test", BASE, StageContext(backend="numba"))
 
 
@@ -202,7 +203,7 @@ def test_a_key_tells_everything_apart_that_decides(scene, monkeypatch):
         dataclasses.replace(run, variant=VARIANTS[1]),
         dataclasses.replace(run, base=dataclasses.replace(BASE, ssim_weight=0.1))]
     keys = {key_of(scene, one) for one in (run, *others)}
-    folders = SceneFolders("other", scene.folders.inputs)
+    folders = SceneFolders("other", scene.folders.capture)
     folders.__dict__["digest"] = "of other images"
     keys.add(key_of(dataclasses.replace(scene, folders=folders), run))
     keys.add(key_of(dataclasses.replace(scene, ctx=StageContext(backend="torch")), run))

@@ -27,7 +27,7 @@ from judge import (
 )
 from lab import FULL, STAGES, VERBS
 
-from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.json_record import sha256_json
 
 Change = Callable[[Path, Path], object]  # of a path, given a folder outside of the workspace
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from facts import raises
 
+from recon_cli.config.stages import RunConfig
 from recon_cli.errors import ConfigError
 from recon_cli.flythrough import camera_plan
 from recon_cli.flythrough.camera_plan import check_frame_memory, frame_size, plan_cameras
@@ -34,7 +35,8 @@ def trained(*more, z_up=True, max_size=300):
     scene = Scene(
         (*views[1::2], *more), (views[2],), tuple(views[0::8]), ("099.png",), points,
         np.zeros((200, 3), np.uint8))
-    return TrainedScene("base", None, "", 0, max_size, scene, z_up, True)
+    config = RunConfig(max_size=max_size, sh_degree=0)
+    return TrainedScene("base", None, "", config, scene, z_up, True)
 
 
 def viewmats(plan):

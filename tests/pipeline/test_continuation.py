@@ -21,7 +21,8 @@ from recon_cli.pipeline.continuation import Start, may_resume
 from recon_cli.pipeline.plan import Job, Target
 from recon_cli.stages import stage
 from recon_cli.workspace.atomic import write_bytes
-from recon_cli.workspace.digests import read_source, sha256_json
+from recon_cli.workspace.digests import read_source
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.manifest import NAME, Manifest
 
 

@@ -15,7 +15,7 @@ from recon_cli.pipeline import clean, plan
 from recon_cli.pipeline.clean import free_space
 from recon_cli.pipeline.plan import Job
 from recon_cli.workspace.atomic import write_bytes
-from recon_cli.workspace.digests import sha256_json
+from recon_cli.workspace.json_record import sha256_json
 
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "flipped": lambda path: path.write_bytes(bytes([path.read_bytes()[0] ^ 1])

@@ -12,6 +12,8 @@ from fake_stages import NAMES, bring, job_at, stale
 from recon_cli.errors import ConfigError, InputError, StageError
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import Job
+from recon_cli.workspace import manifest
+from recon_cli.workspace.atomic import read_json
 from recon_cli.workspace.summaries import IngestSummary
 
 AFTER = {name: NAMES[NAMES.index(name):] for name in NAMES}  # a stage and all behind it
@@ -262,3 +264,20 @@ def test_a_result_made_with_several_values_stays_fresh(job: Job) -> None:
     assert bring(job, "export", changes=between) == []
     assert stale(job) == {}
     assert list(stale(job_at(job.workspace.root, {"export": {"model": "base"}}))) == ["export"]
+
+
+def test_a_run_reads_each_manifest_once(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[tuple[Path, int]] = []
+
+    def count(path: Path, kind: type = object) -> object:
+        if path.name.startswith("manifest"):
+            reads.append((path, path.stat().st_mtime_ns))  # one that is written anew is another
+        return read_json(path, kind)
+
+    monkeypatch.setattr(manifest, "read_json", count)
+    assert bring(job_at(job.workspace.root), *NAMES) == []
+    assert sorted(path.parent.name for path, _ in reads) == sorted(NAMES)
+    reads.clear()
+    settings = {"train": {"iterations": 100}}
+    assert bring(job_at(job.workspace.root, settings), "train", "prune") == ["train", "prune"]
+    assert len(reads) == len(set(reads))

@@ -36,7 +36,8 @@ def place_job(job, **changes):
     return PlaceJob(**{
         "frames": job.frames, "denoised": job.frames, "masks": job.masks, "models": job.parts,
         "out": job.out, "parts": (job.names,), "poses": None, "pose_use": "ignore", "part": 1,
-        "gravity": True, "scale_between": None, "accept_weak": False, "threads": 2, **changes})
+        "gravity": True, "scale_between": None, "held_out": (), "accept_weak": False,
+        "threads": 2, **changes})
 
 
 def part(truth, names, *, motion=None):

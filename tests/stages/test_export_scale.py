@@ -17,6 +17,7 @@ from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.export.coordinate_frame import choose_frame, find_room_frame
+from recon_cli.io.training_scene import PlacedCapture
 from recon_cli.render import render
 from recon_cli.room.scale_fusion import ScaleSource
 from recon_cli.scene.camera import Camera
@@ -103,6 +104,10 @@ def spread_scale(inputs, spread):
     path.write_text(json.dumps(world))
 
 
+def read(inputs):
+    return PlacedCapture.read(inputs.folders)
+
+
 def measured(metres):
     return ExportConfig(scale_between=("000000.png", "000006.png", metres))
 
@@ -110,11 +115,11 @@ def measured(metres):
 def test_what_sfm_knew_and_what_is_measured_later_give_one_scale(inputs, tmp_path):
     # One unit of the mapper had 2 m, by the device to 1%: the world is in metres.
     know_scale(inputs, sources=[ScaleSource("the tracked poses", 2.0, 0.01)])
-    frame = choose_frame(measured(1.01 * APART), inputs)
+    frame = choose_frame(measured(1.01 * APART), read(inputs), None)
     error = np.hypot(0.003, np.sqrt(2) * 0.003 / (1.01 * APART))  # of the measuring
     weights = np.array([error, 0.01])**-2.0
     assert np.log(frame.fused.scale) == pytest.approx(np.log(1.01) * weights[0] / weights.sum())
-    assert find_room_frame(inputs, frame).scale_error == pytest.approx(weights.sum()**-0.5)
+    assert find_room_frame(read(inputs), frame).scale_error == pytest.approx(weights.sum()**-0.5)
     run_export(measured(1.01 * APART), inputs, tmp_path / "out", StageContext())
     record = json.loads((tmp_path / "out" / "transform.json").read_text())
     assert record["scale"]["error"] == pytest.approx(weights.sum()**-0.5)
@@ -140,7 +145,7 @@ def test_a_length_that_contradicts_what_sfm_knew_decides_and_both_are_named(
 
 def test_a_length_of_sfm_and_one_of_export_are_both_used(inputs):
     know_scale(inputs, metric=False, sources=[ScaleSource("--scale-between", 3.0, 0.01)])
-    frame = choose_frame(measured(APART), inputs)
+    frame = choose_frame(measured(APART), read(inputs), None)
     assert [one.name for one in frame.fused.used] == [
         "--scale-between", "--scale-between of recon sfm"]
     assert frame.fused.scale == pytest.approx(1)
@@ -150,14 +155,14 @@ def test_a_length_of_sfm_and_one_of_export_are_both_used(inputs):
 def test_measures_carry_the_interval_of_the_scale_that_sfm_found(inputs, error):
     sources = [] if error == 0.003 else [ScaleSource("sensor depth", 1.0, error)]
     know_scale(inputs, sources=sources)  # without any, the data set's own unit
-    frame = choose_frame(ExportConfig(), inputs)
-    assert find_room_frame(inputs, frame).scale_error == pytest.approx(error)
+    frame = choose_frame(ExportConfig(), read(inputs), None)
+    assert find_room_frame(read(inputs), frame).scale_error == pytest.approx(error)
 
 
 @pytest.mark.parametrize("config", [ExportConfig(), measured(APART)])
 def test_measures_carry_how_far_the_scale_drifts_within_the_capture(inputs, config):
     know_scale(inputs)
-    own = find_room_frame(inputs, choose_frame(config, inputs)).scale_error
+    own = find_room_frame(read(inputs), choose_frame(config, read(inputs), None)).scale_error
     spread_scale(inputs, 0.08)
-    carried = find_room_frame(inputs, choose_frame(config, inputs)).scale_error
+    carried = find_room_frame(read(inputs), choose_frame(config, read(inputs), None)).scale_error
     assert carried == pytest.approx(np.hypot(own, 0.08))

@@ -19,8 +19,8 @@ from recon_cli.context import TrainCallback
 from recon_cli.errors import FormatError, StageError, TrainingError
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export, prune, train
+from recon_cli.train import finished_model
 from recon_cli.train.fit import runner
-from recon_cli.train.prune import prune_run
 
 RUN = RunConfig(**{**vars(CONFIG), "max_size": 400, "sh_degree": 3})
 
@@ -104,7 +104,7 @@ def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(input
 def test_a_killed_recovery_ends_with_the_same_bytes(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         kill_after(119, patch)
-        patch.setattr(prune_run, "read_config", lambda _: RUN)  # checkpoints every 7 steps
+        patch.setattr(finished_model, "read_config", lambda _: RUN)  # checkpoints every 7 steps
         with pytest.raises(Killed):
             run(prune, PRUNE, inputs, tmp_path / "out")
     run(prune, PRUNE, inputs, tmp_path / "out")

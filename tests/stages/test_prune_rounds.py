@@ -17,6 +17,7 @@ from recon_cli.render.registry import use_threads
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
+from recon_cli.train import finished_model
 from recon_cli.train.fit import runner
 from recon_cli.train.fit.state import save_state
 from recon_cli.train.prune import prune_run
@@ -85,7 +86,7 @@ def test_a_run_killed_anywhere_ends_with_the_same_bytes(
     config, inputs, whole, tmp_path, monkeypatch
 ):
     """Each time one write of a state or of the list succeeds more than the time before."""
-    monkeypatch.setattr(prune_run, "read_config", lambda _: RUN)  # a checkpoint every 3 steps
+    monkeypatch.setattr(finished_model, "read_config", lambda _: RUN)  # a checkpoint every 3 steps
     expected, summary = whole[config]
     kills = 0
     while True:
@@ -205,7 +206,7 @@ def test_where_every_removal_costs_too_much_nothing_goes(inputs, tmp_path, caplo
 
 
 def test_a_loss_of_psnr_without_validation_views_is_refused(inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(prune_run, "read_config", lambda _: replace(RUN, validation=0.0))
+    monkeypatch.setattr(finished_model, "read_config", lambda _: replace(RUN, validation=0.0))
     with raises(TrainingError, "validation", "views") as caught:
         run(SEARCH, inputs, tmp_path / "out")
     assert "--validation" in caught.value.hint

@@ -145,7 +145,7 @@ def test_masks_of_no_view_are_named(tmp_path):
 def test_a_continued_run_has_the_masks_of_the_run_before(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     summary = write_masks(first, scene(tmp_path), regions(2), EditedMasks())
-    copy_masks(first, second)
+    copy_masks(first, summary, second)
     assert read_summary(second) == summary
     assert (second / "masks/2.png").read_bytes() == (first / "masks/2.png").read_bytes()
 

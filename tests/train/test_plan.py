@@ -251,11 +251,11 @@ def test_faint_noise_is_no_detail():
 def test_only_memory_limits_the_count_of_the_protocol_3dgs_and_its_time_is_told_by_a_likely_one():
     facts = replace(FACTS, room=4_000_000)
     linear = estimator(Cost(each=0.001))
-    free = make_plan(TrainConfig(protocol="3dgs"), facts, linear)
+    free = make_plan(TrainConfig(protocol="3dgs").settle(), facts, linear)
     assert (free.iterations, free.max_gaussians) == (30_000, 2_000_000)
     assert free.first_gaussians == facts.points  # all of them, as in the reference
-    ours = make_plan(TrainConfig(protocol="recon"), facts, linear)
+    ours = make_plan(TrainConfig(protocol="recon").settle(), facts, linear)
     assert ours.max_gaussians < 250_000
     assert free.seconds < 2 * ours.seconds
-    limited = make_plan(TrainConfig(protocol="3dgs", max_gaussians=50_000), facts, linear)
+    limited = make_plan(TrainConfig(protocol="3dgs", max_gaussians=50_000).settle(), facts, linear)
     assert limited.max_gaussians == 50_000

@@ -18,7 +18,6 @@ from recon_cli.workspace.records import (
     KnownPoses,
     choose_held_out,
     describe_stretches,
-    find_frames,
     name_photos,
     prepare_frames_folder,
     read_frame_list,
@@ -181,6 +180,6 @@ def test_photos_in_a_text_are_named_by_their_own_files(tmp_path):
 
 def test_a_photo_is_found_by_its_own_name_alone_or_with_a_pixel(tmp_path):
     write_photos(tmp_path)
-    assert find_frames(tmp_path, ["2.jpg", "10.jpg:4,5", "000005.png", "test", "0,1,2"]) == (
+    words = ["2.jpg", "10.jpg:4,5", "000005.png", "test", "0,1,2"]
+    assert read_frame_list(tmp_path).find(words) == (
         "000000.png", "000001.png:4,5", "000005.png", "test", "0,1,2")
-    assert find_frames(tmp_path / "none", ["2.jpg"]) == ("2.jpg",)

@@ -25,7 +25,6 @@ from recon_cli.scene.statistics import at_least
 from recon_cli.sfm import database
 from recon_cli.sfm.features import matching, xfeat_weights
 from recon_cli.sfm.features.features import DESCRIPTOR_SCALE
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.features.xfeat import (
     DESCRIPTOR_STEPS,
     LONGER_SIDE,
@@ -42,6 +41,7 @@ from recon_cli.sfm.limits import (
     NEAR_FRAMES,
 )
 from recon_cli.sfm.mapping import mapper, skeleton
+from recon_cli.sfm.model_arrays import Pair
 
 ATTEMPT = "bridge"
 # Of a bridge, besides MIN_POSE_INLIERS: the share of inliers in the mutual matches of XFeat, which

@@ -14,8 +14,8 @@ import numpy as np
 
 from recon_cli.io.tracks import Tracks
 from recon_cli.scene.statistics import at_least
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.limits import FEW_FRAMES
+from recon_cli.sfm.model_arrays import Pair
 
 SHARED = (60, 0.5)  # tracks that a keyframe shares with the next one: at least, and of its own
 LONGEST = 6  # frames from one to the next

@@ -27,6 +27,7 @@ from recon_cli.sfm.features.features import DESCRIPTOR_SCALE
 from recon_cli.sfm.job import CameraGroup, MappingJob, Reporter
 from recon_cli.sfm.limits import COARSEST_KEYPOINTS, MAX_TRIALS, MIN_DEEP_SHARE, MIN_PANORAMA_SHARE
 from recon_cli.sfm.mapping import checks
+from recon_cli.sfm.model_arrays import Pair
 from recon_cli.sfm.results import MatchesResult
 
 CAMERA_MODEL = "OPENCV"  # two focal lengths, two radial and two tangential terms
@@ -42,7 +43,6 @@ WORD_ROUNDS = 10  # of k-means
 CHUNK = 1024
 MAX_ANGLE = 0.7  # radians, of two descriptors that match. COLMAP's (SiftMatchingOptions)
 
-Pair = tuple[str, str]  # file names in order
 Matches = NDArray[np.uint32]  # [M, 2] rows of the keypoints in either image
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm.features.matching import Pair, read_matched_pixels
+from recon_cli.sfm.features.matching import read_matched_pixels
 from recon_cli.sfm.limits import (
     MAX_DRIFT,
     MAX_DRIFT_DEG,
@@ -19,7 +19,7 @@ from recon_cli.sfm.limits import (
     MIN_PAIR_EXPLAINED,
     NEAR_FRAMES,
 )
-from recon_cli.sfm.model_arrays import ModelArrays
+from recon_cli.sfm.model_arrays import ModelArrays, Pair
 from recon_cli.sfm.verdict.evidence import (
     explained_matches,
     inverse_depths,

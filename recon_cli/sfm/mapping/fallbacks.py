@@ -27,7 +27,7 @@ from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, MIN_FRAMES, MI
 from recon_cli.sfm.mapping import checks, mapper, merge_models, parts, skeleton, wide_lens
 from recon_cli.sfm.mapping.merge_models import ModelCandidate
 from recon_cli.sfm.mapping.trusted_part import cuts_models, deliver_parts
-from recon_cli.sfm.model_arrays import registered_images
+from recon_cli.sfm.model_arrays import Pair, registered_images
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.segments import join_segments
 from recon_cli.sfm.verdict.verdict import ModelVerdict, examine
@@ -56,7 +56,7 @@ class Fallback:
 
     name: str
     reason: str  # why a capture begins with it
-    choose_pairs: Callable[[MappingJob, Reporter], set[matching.Pair]]
+    choose_pairs: Callable[[MappingJob, Reporter], set[Pair]]
     find_models: Callable[[MappingJob, Reporter], list[pycolmap.Reconstruction]]
 
 
@@ -395,7 +395,7 @@ def _try_fallback(
     return attempt, candidate
 
 
-def _count_seconds(job: MappingJob, wanted: Collection[matching.Pair], tried: int) -> float:
+def _count_seconds(job: MappingJob, wanted: Collection[Pair], tried: int) -> float:
     """Returns the CPU seconds of all attempts with a further one, on the machine of `COSTS`."""
     mapping = "photo_mapping" if job.tracks is None else "walk_mapping"
     return TimeEstimator(COSTS).total([
@@ -456,7 +456,7 @@ def _incremental(pairs: str, reason: str) -> Fallback:
     return Fallback(pairs, reason, _PAIRS[pairs], mapper.map_incrementally)
 
 
-_PAIRS: dict[str, Callable[[MappingJob, Reporter], set[matching.Pair]]] = {
+_PAIRS: dict[str, Callable[[MappingJob, Reporter], set[Pair]]] = {
     "exhaustive": lambda job, _: matching.exhaustive_pairs(job.names),
     "sequential": lambda job, _: matching.sequential_pairs(job.names),
     "retrieval": lambda job, _: matching.near_or_similar_pairs(

@@ -38,12 +38,12 @@ from recon_cli.sfm.features.keyframes import (
     side_pairs,
     track_rows,
 )
-from recon_cli.sfm.features.matching import Pair, similar_pairs
+from recon_cli.sfm.features.matching import similar_pairs
 from recon_cli.sfm.features.pair_checks import check_pairs, list_models
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder, publish
 from recon_cli.sfm.limits import ENOUGH_FRAMES, FEW_PAIR_MATCHES, NEAR_FRAMES
 from recon_cli.sfm.mapping import mapper, merge_models
-from recon_cli.sfm.model_arrays import registered_images
+from recon_cli.sfm.model_arrays import Pair, registered_images
 from recon_cli.sfm.segments.loop_closure import optimize_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
 from recon_cli.workspace.steps import StepFolder

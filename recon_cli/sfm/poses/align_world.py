@@ -7,9 +7,8 @@ its evidence. The user gives a scale by --scale-between: a known distance betwee
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +37,7 @@ from recon_cli.room.scale_fusion import (
 from recon_cli.scene.camera import Lens
 from recon_cli.scene.gravity import Gravity, find_gravity, turn_onto, upright_axes
 from recon_cli.scene.similarity import Similarity
-from recon_cli.workspace.records import find_frames
+from recon_cli.workspace.records import FrameList
 from recon_cli.workspace.summaries import WorldEvidence, WorldSummary
 
 
@@ -60,7 +59,7 @@ class WorldFrame:
 
 
 def find_places(
-    ingest: Path, scale_between: tuple[str, str, float] | None, names: Collection[str]
+    frames: FrameList, scale_between: tuple[str, str, float] | None
 ) -> tuple[str, str, float] | None:
     """Returns the two places of --scale-between by the names of frames, and their distance.
 
@@ -68,9 +67,9 @@ def find_places(
     """
     if scale_between is None:
         return None
-    first, second = find_frames(ingest, scale_between[:2])
+    first, second = frames.find(scale_between[:2])
     for place in (first, second):
-        parse_place(place, names)
+        parse_place(place, [frame.name for frame in frames.frames])
     return first, second, scale_between[2]
 
 

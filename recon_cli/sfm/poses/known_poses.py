@@ -30,7 +30,7 @@ from recon_cli.sfm.limits import (
 )
 from recon_cli.sfm.mapping import checks, fallbacks, mapper, parts
 from recon_cli.sfm.mapping.merge_models import build_posed_model
-from recon_cli.sfm.model_arrays import viewmat_of
+from recon_cli.sfm.model_arrays import Pair, viewmat_of
 from recon_cli.sfm.poses import tracked_poses
 from recon_cli.sfm.results import FeaturesResult, MatchesResult, ModelResult
 from recon_cli.sfm.verdict.evidence import gather_evidence
@@ -85,7 +85,7 @@ def match_known(job: MappingJob, report: Reporter) -> MatchesResult:
 
 def near_pairs(
     viewmats: Mapping[str, NDArray[np.float64]],  # [4, 4] world to camera by name
-) -> set[matching.Pair]:
+) -> set[Pair]:
     """Returns each image paired with the nearest that look in about the same direction."""
     return {
         (min(name, other), max(name, other))

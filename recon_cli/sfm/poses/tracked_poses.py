@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from recon_cli.errors import format_count
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.sfm.features import matching
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.job import MappingJob, Reporter
 from recon_cli.sfm.limits import (
     LOOP_CANDIDATES,
@@ -36,7 +35,7 @@ from recon_cli.sfm.mapping.prior_adjustment import (
     make_points,
     measure_deviation,
 )
-from recon_cli.sfm.model_arrays import registered_images, viewmat_of
+from recon_cli.sfm.model_arrays import Pair, registered_images, viewmat_of
 from recon_cli.sfm.segments.loop_closure import optimize_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
 from recon_cli.sfm.verdict.evidence import explained_matches

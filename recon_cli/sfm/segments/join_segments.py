@@ -28,7 +28,7 @@ from recon_cli.sfm.features.pair_checks import check_pairs, list_views
 from recon_cli.sfm.job import MappingJob, Reporter, fresh_folder
 from recon_cli.sfm.limits import LOOP_CANDIDATES, MAX_RESIDUAL, NEAR_FRAMES
 from recon_cli.sfm.mapping import mapper, merge_models, skeleton
-from recon_cli.sfm.model_arrays import registered_images
+from recon_cli.sfm.model_arrays import Pair, registered_images
 from recon_cli.sfm.results import MatchesResult, SplitResult
 from recon_cli.sfm.segments.loop_closure import Node, move_frames, optimize_segments
 from recon_cli.sfm.segments.segment_joins import (
@@ -47,8 +47,6 @@ from recon_cli.sfm.segments.shared_points import (
 )
 from recon_cli.sfm.segments.view_overlap import overlapping_images
 from recon_cli.workspace import atomic
-
-Pair = matching.Pair
 
 REPORT = "segments.json"  # in the stage's folder: the segments, and the evidence of their joins
 MODEL_FOLDER = "parts/1"

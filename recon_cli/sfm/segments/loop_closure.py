@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.limits import (
     MAX_DRIFT,
     MAX_DRIFT_DEG,
@@ -25,7 +24,7 @@ from recon_cli.sfm.limits import (
     MIN_LOOP_SHARE,
     NEAR_IN_WALK,
 )
-from recon_cli.sfm.model_arrays import registered_images, viewmat_of
+from recon_cli.sfm.model_arrays import Pair, registered_images, viewmat_of
 from recon_cli.sfm.segments.edge_information import RUN, measure_information
 from recon_cli.sfm.segments.pose_graph import (
     Constraints,

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from recon_cli.scene.matches import MIN_PAIR_INLIERS
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.statistics import COARSE_SAMPLE
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.limits import (
     MAX_DRIFT,
     MAX_DRIFT_DEG,
@@ -31,6 +30,7 @@ from recon_cli.sfm.limits import (
     MIN_POSE_INLIERS,
     NEAR_IN_WALK,
 )
+from recon_cli.sfm.model_arrays import Pair
 from recon_cli.sfm.segments.shared_points import SegmentCameras, SharedPoints, estimate_similarity
 
 # Nine of ten cameras of common frames: of the extent of the smaller segment, and degrees. A median

@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from recon_cli.io.colmap_library import pycolmap
 from recon_cli.scene.similarity import Similarity
-from recon_cli.sfm.features.matching import Pair
 from recon_cli.sfm.limits import MAX_TRIALS, MIN_POSE_INLIERS
-from recon_cli.sfm.model_arrays import ModelArrays
+from recon_cli.sfm.model_arrays import ModelArrays, Pair
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.io.colmap_library import pycolmap
-from recon_cli.sfm.features.matching import Pair
-from recon_cli.sfm.model_arrays import registered_images
+from recon_cli.sfm.model_arrays import Pair, registered_images
 
 # Pairs that the skeleton shows to overlap, per image, spread over the WIDEST from most to least
 # overlap: the closest tell little about depth. Errors of the cameras of two rooms with 10, 8 and 6

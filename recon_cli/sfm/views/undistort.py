@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from recon_cli.errors import format_count
 from recon_cli.io.colmap_library import check_model, pycolmap, write_model
 from recon_cli.io.images import read_png, write_png
-from recon_cli.io.training_scene import held_out_names
 from recon_cli.room.scale import ScaleBetween
 from recon_cli.scene.camera import Lens
 from recon_cli.scene.faces import is_cube_face, view_name
@@ -86,9 +85,8 @@ def place_model(
     viewmats = {name: viewmat_of(image) for name, image in images.items()}
     device = ask_device(job, model, viewmats)
     if device.depth_scale is not None and job.pose_use != "keep" and job.poses is not None:
-        ingest = job.poses.parent
-        add_depth_points(model, ingest, job.frames, device.depth_scale,
-                         without=held_out_names(ingest))
+        add_depth_points(model, job.poses.parent, job.frames, device.depth_scale,
+                         without=job.held_out)
     several = {number for number, camera in model.cameras.items() if has_faces(camera)}
     world = world_transform(
         np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3), viewmats,

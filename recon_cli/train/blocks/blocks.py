@@ -41,7 +41,8 @@ from recon_cli.scene.scene import Scene
 from recon_cli.train.masks import with_masks
 from recon_cli.train.one_model import fit_scene
 from recon_cli.workspace import atomic
-from recon_cli.workspace.digests import digest_outputs, sha256_json
+from recon_cli.workspace.digests import digest_outputs
+from recon_cli.workspace.json_record import sha256_json
 from recon_cli.workspace.layout import Workspace, disk_errors
 from recon_cli.workspace.manifest import Manifest, ResultKey, RunRecord, find_changed_outputs
 from recon_cli.workspace.steps import JOBS

@@ -30,7 +30,7 @@ from recon_cli.scene.splats import Splats, joined
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.train.blocks.blocks import MERGE_SHARE, BlockJob, record
 from recon_cli.train.fit.initialize import begin_state, restore_state
-from recon_cli.train.fit.runner import CHECKPOINT, LOG, RunSegment, run_fit
+from recon_cli.train.fit.runner import CHECKPOINT, RunSegment, run_fit
 from recon_cli.train.fit.schedule import make_schedule
 from recon_cli.train.fit.state import TrainState
 from recon_cli.train.fit.train_data import gaussians_that_fit, load_task, read_config, write_config
@@ -114,14 +114,15 @@ def merge_blocks(
         iterations=0 if state is None else state.steps, seam_views=len(values),
         seam_change_db=round(float(np.mean(values)), 3) if values else None,
         worst_seam_db=round(min(values), 3) if values else None)
-    last = None if state is None else LogRow.read_all(out / LOG)[-1]
+    last = None if state is None else LogRow.read_all(out / LogRow.FILE)[-1]
     return _summarize(
-        config, [block.summary for block in blocks], merge, len(splats), scene, last, out)
+        config, [block.summary for block in blocks], merge, len(splats), scene, last,
+        state.photometry.summarize() if state and state.photometry else None)
 
 
 def _summarize(
     config: RunConfig, blocks: Sequence[TrainSummary], merge: MergeSummary, gaussians: int,
-    scene: Scene, last: LogRow | None, out: Path,
+    scene: Scene, last: LogRow | None, photometry: PhotometrySummary | None,
 ) -> TrainSummary:
     """Returns the summary of the whole; `last` is the end of the log of the fine-tuning, if any."""
     cameras = [fit_camera(view.camera, config.max_size) for view in scene.train]
@@ -138,7 +139,7 @@ def _summarize(
         estimated_seconds=sum(block.estimated_seconds for block in blocks),
         calibration_seconds=sum(block.calibration_seconds for block in blocks),
         cuda_peak_bytes=max(block.cuda_peak_bytes for block in blocks), blocks=len(blocks),
-        merge=merge, photometry=PhotometrySummary.read(out))
+        merge=merge, photometry=photometry)
 
 
 def _run_config(

@@ -23,7 +23,6 @@ from recon_cli.workspace import steps
 from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.summaries import LogRow
 
-LOG = "log.jsonl"
 CHECKPOINT = "checkpoint.safetensors"
 
 
@@ -56,7 +55,7 @@ def run_fit(
     with deferring() as interrupted, ctx.progress.bar(
         segment.label, total, unit="step", done=state.iteration - segment.first
     ) as bar:
-        log = TrainLog(out / LOG, state.iteration, segment.earlier_seconds)
+        log = TrainLog(out / LogRow.FILE, state.iteration, segment.earlier_seconds)
         callbacks = (
             log,
             *ctx.callbacks,

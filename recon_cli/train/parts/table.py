@@ -11,7 +11,7 @@ from typing import Any
 
 from recon_cli.config.stages import RunConfig, TrainConfig
 from recon_cli.train.fit.schedule import Schedule
-from recon_cli.train.parts import background, depth, exposure, harmonics, moving, stereo, vignette
+from recon_cli.train.parts import background, depth, exposure, harmonics, stereo, vignette
 from recon_cli.train.parts.part import Part, Sign, TrialScene
 
 
@@ -22,8 +22,6 @@ def _find_twins(scene: TrialScene) -> Sign:
 IMAGES = Part("images", _find_twins, values=("original", "denoised"))
 PARTS = (stereo.PART, IMAGES, background.PART, exposure.PART, vignette.PART, depth.PART,
          harmonics.PART)
-# masks are not a part of the model, but are searched with all of it
-TRIED = (*PARTS, moving.PART)
 
 
 def model_parts(config: TrainConfig) -> dict[str, Any]:

@@ -29,9 +29,10 @@ from recon_cli.train.fit.loop import fit
 from recon_cli.train.fit.schedule import Schedule
 from recon_cli.train.fit.state import TrainState
 from recon_cli.train.masks import Regions
+from recon_cli.train.parts import moving
 from recon_cli.train.parts.decisions import NO_TIME, Rule, Split, decide, skip_trial, split
 from recon_cli.train.parts.part import AUTO, LEVEL, Part, TrialScene
-from recon_cli.train.parts.table import PARTS, TRIED, model_parts, with_part, without_open_parts
+from recon_cli.train.parts.table import PARTS, model_parts, with_part, without_open_parts
 from recon_cli.workspace.summaries import TrialDecision
 
 # One to two seconds a run on two cores. Twice the steps found the same on the rooms and fox.
@@ -58,7 +59,8 @@ class Needs:
 def examine(scene: TrialScene) -> Needs:
     """Returns the parts that a scene needs; those that options switch on or off are not tried."""
     trials, config = Trials(scene), scene.config
-    for part in TRIED:
+    # masks are not a part of the model, but are searched with all of it
+    for part in (*PARTS, moving.PART):
         if part.is_open(scene) if part.is_open else getattr(config, part.name) == AUTO:
             value = part.settle(trials, config) if part.settle else trials.settle(part, config)
             config = with_part(config, part, value)

@@ -21,15 +21,15 @@ from recon_cli.config.stages import PruneConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import ConfigError
 from recon_cli.io.training_scene import load_scene
-from recon_cli.splats.ply import read_ply
+from recon_cli.train.finished_model import FINAL, FinishedModel
 from recon_cli.train.fit.importance import Importance
 from recon_cli.train.fit.initialize import make_finished_state, restore_state
 from recon_cli.train.fit.loop import validation_psnr
-from recon_cli.train.fit.runner import LOG, RunSegment, TrainLog, run_fit, seconds_at
+from recon_cli.train.fit.runner import RunSegment, TrainLog, run_fit, seconds_at
 from recon_cli.train.fit.schedule import RecoverySchedule
 from recon_cli.train.fit.state import TrainState, save_state
 from recon_cli.train.fit.task import Task
-from recon_cli.train.fit.train_data import load_task, read_config
+from recon_cli.train.fit.train_data import load_task
 from recon_cli.train.masks import with_masks
 from recon_cli.train.prune.prune_loop import (
     LAST_ROUND,
@@ -39,8 +39,7 @@ from recon_cli.train.prune.prune_loop import (
     rounds_within,
 )
 from recon_cli.workspace.atomic import delete, read_json, write_bytes
-from recon_cli.workspace.records import ImportRecord
-from recon_cli.workspace.summaries import JsonRecord, TrainPlan
+from recon_cli.workspace.summaries import JsonRecord, LogRow
 
 logger = logging.getLogger("recon")
 
@@ -91,10 +90,9 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
     Raises:
         ConfigError: the middle of a run is asked for that took place elsewhere.
     """
-    train = inputs.folders["train"]
-    final = train / "final.safetensors"
-    single = final.exists()  # else the scene was imported, or merged from blocks
-    import_record = None if single else ImportRecord.read(train)
+    model = FinishedModel.read(inputs.folders["train"])
+    single = model.trained  # else the scene was imported, or merged from blocks
+    import_record = None if single else model.import_record
     if import_record and config.at == "mid":
         raise ConfigError(
             f"at is mid, but the scene was imported from {import_record.file}: the middle of its "
@@ -105,28 +103,30 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
         ctx.notice("The blocks that the scene was trained in have no common middle: the finished "
                    "model is pruned.")
         config = dataclasses.replace(config, at="end")
-    train_config = read_config(train)
-    scene = with_masks(load_scene(inputs.folders, validation=train_config.validation), train)
-    task = load_task(scene, train_config, ctx)
-    path = train / "mid.safetensors" if config.at == "mid" else final
+    scene = load_scene(inputs.folders, validation=model.config.validation)
+    task = load_task(with_masks(scene, model.folder), model.config, ctx)
+    final = model.folder / FINAL
+    path = model.folder / "mid.safetensors" if config.at == "mid" else final
 
     def begin() -> TrainState:
         if not single:
-            return make_finished_state(read_ply(train / "splats.ply"), task)
+            return make_finished_state(model.read_splats(), task)
         return restore_state(path, task)
 
     start, epoch = begin(), task.schedule.epoch(len(task.train))
     steps = config.recovery
     if steps is None:
-        steps = count_recovery_steps(train_config.iterations, epoch)
+        steps = count_recovery_steps(model.config.iterations, epoch)
         if config.at == "mid":
             # as many as the unpruned run took, which may have stopped early; where it continued for
             # a few steps only, too few to recover
             rest = restore_state(final, task).steps - start.steps
-            steps = max(rest, steps) if _was_continued(train) else rest
+            continued = model.plan is not None and model.plan.continues_at is not None
+            steps = max(rest, steps) if continued else rest
     return PruneSource(
         config, task, begin, start.iteration, start.iteration + steps,
-        config.rounds or rounds_within(steps, epoch), seconds_at(train / LOG, start.iteration))
+        config.rounds or rounds_within(steps, epoch),
+        seconds_at(model.folder / LogRow.FILE, start.iteration))
 
 
 def count_recovery_steps(iterations: int, epoch: int) -> int:
@@ -135,12 +135,6 @@ def count_recovery_steps(iterations: int, epoch: int) -> int:
     The fewest rounds have room before the last one, each scored by an epoch of its own.
     """
     return max(iterations // _END_RECOVERY, round(ROUND_COUNTS[0] / LAST_ROUND) * epoch)
-
-
-def _was_continued(train: Path) -> bool:
-    """Returns whether a training continued a finished model."""
-    plan = TrainPlan.read(train) if (train / TrainPlan.FILE).exists() else None
-    return plan is not None and plan.continues_at is not None
 
 
 class StoredPruneRun(PruneRun):
@@ -176,7 +170,9 @@ class StoredPruneRun(PruneRun):
         self._trained = 0.0, 0.0
         begin, cpu_begin = time.perf_counter(), time.process_time()
         score = super().score(until)
-        TrainLog(self._out / LOG, self.state.iteration, self.source.earlier_seconds).add_idle(
+        log = TrainLog(
+            self._out / LogRow.FILE, self.state.iteration, self.source.earlier_seconds)
+        log.add_idle(
             self.state.iteration, time.perf_counter() - begin - self._trained[0],
             time.process_time() - cpu_begin - self._trained[1])
         return score
