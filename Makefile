@@ -9,6 +9,8 @@ DEV := $(VENV)/.dev
 HEAVY := integration or browser or compile or slow
 WORKERS ?= 2
 ON_ALL := -n $(WORKERS) --dist worksteal
+# Tests that start programs wait for them half of the time.
+ON_MORE := -n $$(($(WORKERS) * 2)) --dist worksteal
 PYTEST := $(BIN)/python -m pytest -q -rs --durations 20 $(ON_ALL)
 
 # The lowest versions that pyproject.toml allows, on the oldest Python that it allows.
@@ -30,16 +32,17 @@ test: $(DEV)
 OTHER_CPU ?= ATEN_CPU_CAPABILITY=default
 
 test-other-cpu: $(DEV)
-	env $(OTHER_CPU) $(PYTEST) -m "not ($(HEAVY))" tests/render tests/train tests/stereo
+	env $(OTHER_CPU) $(PYTEST) -m "not (browser or compile or slow)" \
+	    tests/render tests/train tests/stereo
 
 # Kernels that one version of numba compiled are of no use to another: they have their own place.
 test-floors: $(FLOORS)/.ready
 	RECON_CACHE_DIR=$(CURDIR)/$(FLOORS)/cache $(FLOORS)/bin/python -m pytest -q $(ON_ALL) \
-	    -m "floors and not (browser or slow)"
+	    -m "floors and not (browser or slow)" $$(grep -rl "mark.floors" tests --include="test_*.py")
 
 # What `make test` leaves out, and the tests by Hypothesis again with all their examples.
 test-rest: $(DEV)
-	HYPOTHESIS_PROFILE=full $(PYTEST) -m "$(HEAVY) or hypothesis"
+	HYPOTHESIS_PROFILE=full $(PYTEST) $(ON_MORE) -m "$(HEAVY) or hypothesis"
 
 test-all: $(DEV)
 	HYPOTHESIS_PROFILE=full $(PYTEST) -m ""

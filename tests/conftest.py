@@ -32,6 +32,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # as many workers as cores: one thread 
 # A shell lets what it runs in the background ignore Ctrl-C, and every process below inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 load_profile()
+HEAVY = ("integration", "browser", "compile", "slow")  # markers that `make test` leaves out
+_running: list[pytest.Item] = []  # the test that runs
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
@@ -43,6 +45,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.browser)
         if fixtures & {"damaged_run", "repaired_run", "avx2_run"}:
             item.add_marker(pytest.mark.compile)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Lets only tests with a marker start programs: the others are for every change of a line."""
+    _running.append(item)
+    try:
+        return (yield)
+    finally:
+        _running.clear()
+
+
+@sys.addaudithook
+def _refuse_programs(event: str, _arguments: tuple[object, ...]) -> None:
+    if event == "subprocess.Popen" and _running and not any(
+            map(_running[0].get_closest_marker, HEAVY)):
+        pytest.fail("This test starts a program: mark it `integration`.")
 
 
 @pytest.hookimpl(wrapper=True)

@@ -176,6 +176,7 @@ CLAIMS = {
     "rad": claim_rad, "ksplat": claim_ksplat}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("row", READABLE, ids=lambda row: row.name)
 def test_a_small_file_that_claims_to_be_a_huge_scene_is_refused(row, tmp_path: Path) -> None:
     path = tmp_path / ("lod-meta.json" if row.name == "lod" else f"claim.{row.name}")
@@ -257,6 +258,7 @@ def read_all(folder: Path) -> None:
             image.depth.read()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", LAYOUT_CLAIMS)
 def test_a_data_set_that_claims_to_be_huge_is_refused(name: str, tmp_path: Path) -> None:
     folder = tmp_path / "set"
@@ -268,6 +270,7 @@ def test_a_data_set_that_claims_to_be_huge_is_refused(name: str, tmp_path: Path)
     assert seconds < MOST_SECONDS
 
 
+@pytest.mark.integration
 def test_a_recording_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "walk.r3d"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

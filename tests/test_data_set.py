@@ -22,6 +22,7 @@ def workspace(tmp_path_factory):
     return base / "ws"
 
 
+@pytest.mark.integration
 def test_the_views_that_the_set_holds_out_are_the_ones_that_are_scored(workspace):
     metrics = json.loads((workspace / "evaluate" / "metrics.json").read_text())
     names = [view["name"] for view in metrics["models"]["base"]["views"]]
@@ -32,6 +33,7 @@ def test_the_views_that_the_set_holds_out_are_the_ones_that_are_scored(workspace
     assert metrics["models"]["base"]["psnr_db"] > 15  # one colour: anything that fits beats this
 
 
+@pytest.mark.integration
 def test_nothing_was_mapped_and_the_unit_stayed(workspace):
     assert not (workspace / "sfm" / "database.db").exists()
     world = json.loads((workspace / "place" / "world.json").read_text())
@@ -42,6 +44,7 @@ def test_nothing_was_mapped_and_the_unit_stayed(workspace):
     assert 2 < float(np.median(splats.means[:, 2].numpy())) < 7
 
 
+@pytest.mark.integration
 def test_training_does_not_see_depth_or_pixels_of_held_out_views(workspace):
     manifest = json.loads((workspace / "train" / "manifest.json").read_text())
     assert manifest["summary"]["training_views"] == 8

@@ -30,6 +30,7 @@ def test_the_index_lists_every_page():
             assert f"({page.name})" in index
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("generator", ["generate_cli.py", "generate_api.py"])
 def test_a_generated_page_is_up_to_date(generator):
     command = [sys.executable, str(ROOT / "docs" / generator), "--check"]

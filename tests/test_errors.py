@@ -1,6 +1,8 @@
 import ast
 from pathlib import Path
 
+import pytest
+
 import recon_cli
 from recon_cli import errors
 from recon_cli.errors import FormatError, InputError, ReconError, list_names
@@ -25,6 +27,7 @@ def _find_error_classes() -> dict[str, bool]:
     return usual
 
 
+@pytest.mark.integration
 def test_every_error_says_what_to_type_next() -> None:
     usual, without = _find_error_classes(), []
     for path in sorted(PACKAGE.rglob("*.py")):

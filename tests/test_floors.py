@@ -66,6 +66,7 @@ def test_every_dependency_has_one_floor_which_the_tested_versions_satisfy():
             assert tested[name] >= version, name
 
 
+@pytest.mark.integration
 def test_every_package_that_the_code_imports_is_a_dependency():
     imported = {
         name.partition(".")[0] for path in (ROOT / "recon_cli").rglob("*.py")
@@ -91,6 +92,7 @@ def test_every_module_of_the_package_can_be_imported():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.integration
 def test_the_script_prints_a_line_for_each_package():
     done = subprocess.run([sys.executable, ROOT / "tests" / "floors.py", PYPROJECT],
                           capture_output=True, text=True, check=True)

@@ -75,6 +75,7 @@ def on_windows(monkeypatch):
     monkeypatch.setattr(os, "open", refusing_folders)
 
 
+@pytest.mark.integration
 def test_what_only_posix_has_is_asked_for_before_it_is_used():
     found = {(name, where) for where, node in all_nodes(ast.Attribute)
              if MISSING.fullmatch(name := dotted(node))}
@@ -90,6 +91,7 @@ def test_no_module_of_posix_alone_is_imported():
         assert node.module not in POSIX_MODULES, where
 
 
+@pytest.mark.integration
 def test_text_is_read_and_written_as_utf8_whatever_the_system_prefers():
     for where, node in all_nodes(ast.Call):
         if not isinstance(node.func, ast.Attribute):
@@ -302,6 +304,7 @@ def test_a_port_in_use_is_not_shared_on_windows(monkeypatch):
     assert len(asked) == 1
 
 
+@pytest.mark.integration
 def test_every_program_of_recon_runs_as_a_module_without_make(tmp_path):
     done = subprocess.run(
         processes.python_command("-m", "recon_cli", "demo", "--help"), cwd=tmp_path,

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from recon_cli import processes
 from recon_cli.processes import child_environment, protect_children, start_module
 
@@ -48,6 +50,7 @@ def starts(path):
                     yield name
 
 
+@pytest.mark.integration
 def test_only_one_module_starts_programs():
     found = {(path.relative_to(PACKAGE).as_posix(), name)
              for path in PACKAGE.rglob("*.py") for name in starts(path)}
@@ -66,6 +69,7 @@ def test_every_program_that_is_started_is_python_with_a_safe_path():
         assert given["env"].startswith("child_environment(")
 
 
+@pytest.mark.integration
 def test_a_module_beside_the_data_is_not_run(tmp_path):
     for name in ("numpy.py", "recon_cli.py", "random.py", "sitecustomize.py"):
         (tmp_path / name).write_text("open('run', 'w')", encoding="utf-8")
@@ -76,6 +80,7 @@ def test_a_module_beside_the_data_is_not_run(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.integration
 def test_nor_is_one_run_that_an_empty_or_relative_entry_of_pythonpath_names(
     tmp_path, monkeypatch
 ):
@@ -93,6 +98,7 @@ def test_nor_is_one_run_that_an_empty_or_relative_entry_of_pythonpath_names(
     assert not (tmp_path / "data" / "run").exists()
 
 
+@pytest.mark.integration
 def test_processes_that_libraries_start_are_protected_as_well(tmp_path, monkeypatch):
     (tmp_path / "random.py").write_text("open('run', 'w')", encoding="utf-8")
     monkeypatch.setenv("PYTHONSAFEPATH", "")

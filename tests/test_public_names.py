@@ -20,6 +20,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         recon_cli.rasterisation  # noqa: B018
 
 
+@pytest.mark.integration
 def test_the_package_alone_imports_nothing_heavy() -> None:
     code = ("import sys, recon_cli; "
             "print(*{'torch', 'numpy', 'numba', 'click'} & set(sys.modules))")
@@ -30,6 +31,7 @@ def test_the_package_alone_imports_nothing_heavy() -> None:
 SQUEEZE = "import zlib; print(len(zlib.decompress(zlib.compress(bytes(100000)))))"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("first", ["import recon_cli, pycolmap", "import zlib, pycolmap, recon_cli",
                                    "from recon_cli import Workspace; import pycolmap"])
 def test_beside_pycolmap_compressing_works(first: str) -> None:
@@ -38,6 +40,7 @@ def test_beside_pycolmap_compressing_works(first: str) -> None:
     assert done.stdout.split() == ["100000"]
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(sys.platform != "linux" or "zlib" in sys.builtin_module_names,
                     reason="here zlib is no library that pycolmap's could be mixed up with")
 @pytest.mark.parametrize("then", ["from recon_cli import Workspace", "import recon_cli.api"])

@@ -44,6 +44,7 @@ def test_a_signal_that_is_ignored_stays_so():
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("number", CODES)
 def test_a_signal_at_the_very_end_does_not_change_the_exit_code(number):
     code = (f"import os, sys\nfrom recon_cli.__main__ import main\nclass Last:\n"
@@ -109,6 +110,7 @@ def test_a_deferred_signal_cuts_nothing_and_is_not_lost(monkeypatch):
         insist()
 
 
+@pytest.mark.integration
 def test_a_later_signal_ends_the_process_at_once():
     code = ("import os, signal, sys, time\n"
             "from recon_cli import signals\n"
@@ -124,6 +126,7 @@ def test_a_later_signal_ends_the_process_at_once():
     assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, b"")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("in_thread", [False, True])
 def test_native_code_that_takes_a_signal_gives_it_back(in_thread):
     code = ("import os, signal, threading, time\n"

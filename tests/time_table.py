@@ -28,7 +28,7 @@ FOLDER = "TIME_TABLE"  # environment variable: where each process writes what it
 TESTS = Path(__file__).parent
 ROWS = int(os.environ.get("ROWS", "25"))  # of a table
 LENGTHS = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0)
-LONG = 2.0  # CPU seconds of a test that needs a marker
+LONG = 0.3  # CPU seconds, from which on a test needs a marker
 
 _spent: dict[str, Counter[str]] = {
     "collected": Counter(), "fixtures": Counter(), "tests": Counter()}

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from PIL import ExifTags, Image
 
+FILM_DIAGONAL = 43.267  # mm; CIPA DCG-001 defines the 35 mm equivalent by the diagonal
 # EXIF 2.32, FocalPlaneResolutionUnit, in mm; 4 and 5 are not in it but in TIFF/EP (ISO 12234-2).
 UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # Sensors of phones are 4 mm wide, of medium format 54 mm: values far outside are wrong.
@@ -32,7 +33,7 @@ def read_lens(exif: Image.Exif, width: int, height: int) -> ExifLens:
     film = _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     pixels = None
     if film is not None:
-        pixels = math.hypot(width, height) * film / math.hypot(36, 24)
+        pixels = math.hypot(width, height) * film / FILM_DIAGONAL
     elif focal is not None:
         sensor = _sensor_mm(detail)
         pixels = None if sensor is None else max(width, height) * focal / sensor

@@ -126,6 +126,7 @@ def test_what_is_no_data_set_is_refused(tmp_path) -> None:
         read_cameras(tmp_path)
 
 
+@pytest.mark.integration
 def test_cameras_of_another_program_are_those_that_ingest_reads(shared_data) -> None:
     from recon_cli.datasets.layouts import read_posed
 

@@ -55,6 +55,7 @@ def test_the_names_at_the_top_can_be_imported() -> None:
     exec(BLOCK.findall(TOP)[0], {})
 
 
+@pytest.mark.integration
 def test_an_image_is_fitted(monkeypatch, tmp_path) -> None:
     photo = smooth_image(64, 96)
     cv2.imwrite(str(tmp_path / "photo.jpg"), photo[..., ::-1])

@@ -38,6 +38,7 @@ def test_no_public_signature_has_changed(generator) -> None:
     assert (gone, new) == ([], []), RENEW
 
 
+@pytest.mark.integration
 def test_a_changed_signature_is_found(generator, monkeypatch) -> None:
     def render(splats: object) -> None:
         """Has lost its camera."""
@@ -65,6 +66,7 @@ def test_type_checkers_see_the_names_that_are_loaded_lazily() -> None:
     assert {name: module for module, name in imported} == api._HOMES
 
 
+@pytest.mark.integration
 def test_the_import_loads_neither_torch_nor_click() -> None:
     code = ("import sys, recon_cli.api; from recon_cli.api import Workspace; "
             "print(*{'torch', 'numba', 'click', 'pycolmap'} & set(sys.modules))")

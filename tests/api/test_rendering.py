@@ -73,6 +73,7 @@ def test_the_background_shows_through() -> None:
     np.testing.assert_allclose(output.rgb[..., 2], 1 - output.alpha, atol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_a_gaussian_contributes_is_the_sum_over_its_pixels(backend: str) -> None:
     found = measure_contributions(

@@ -46,6 +46,7 @@ def config_of(opened: Workspace, stage: str) -> dict[str, object]:
     return manifest.key.config
 
 
+@pytest.mark.integration
 def test_each_method_runs_its_stage_and_what_that_needs(fakes: Workspace, tmp_path: Path) -> None:
     assert fakes.ingest(str(tmp_path / "room.mp4")).ran
     trained = fakes.train(iterations=7)  # denoise and sfm run first

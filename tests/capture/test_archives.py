@@ -27,6 +27,7 @@ def pack(path):
     return path
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [
     "my photos.zip", "scan.r3d", "room.tar", "room.tar.gz", "no_suffix"])
 def test_an_archive_is_refused_with_the_command_that_unpacks_it(tmp_path, name):

@@ -75,6 +75,7 @@ def test_the_thumbnails_stand_in_order(tmp_path):
     assert centres == sorted(centres)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("size", [(160, 96), (96, 160), (100, 100), (1000, 100)])
 def test_the_sheet_stays_small_however_long_the_capture(tmp_path, size):
     reasons = ([Reason.KEPT] + [Reason.CLOSE] * 20 + [Reason.BLURRED]) * 300

@@ -92,6 +92,7 @@ def test_a_shift_is_its_share_of_the_width():
     np.testing.assert_allclose(steps[1:], 4 / 320, atol=TOLERANCE)
 
 
+@pytest.mark.integration
 def test_the_way_does_not_depend_on_the_frame_rate():
     slow, fast = pan(81, 1), pan(81, 1)[::8]
     assert measured(slow).sum() == pytest.approx(80 / 320, rel=0.02)
@@ -104,6 +105,7 @@ def test_large_frames_count_alike():
     assert measured(large).sum() == pytest.approx(measured(small).sum(), rel=0.02)
 
 
+@pytest.mark.integration
 def test_a_camera_on_a_tripod_does_not_creep_through_noise():
     still = texture(180, 320)[:, :, 0].astype(float)
     noise = np.random.default_rng(0)

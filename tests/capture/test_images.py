@@ -302,6 +302,7 @@ def test_what_is_transparent_shows_black(tmp_path):
     assert (rgb[4:] == 200).all()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp", "a.heic"])
 def test_half_a_photo_is_refused(tmp_path, name):
     inspect_any(tmp_path)

@@ -82,6 +82,7 @@ def test_a_frame_of_a_few_pixels_can_be_filtered():
         [[90] * 3] * 2] * 3
 
 
+@pytest.mark.integration
 def test_a_large_frame_is_measured_by_the_middle_of_its_tiles():
     generator = np.random.default_rng(0)
     frame = np.clip(np.rint(generator.normal(120, 6, (1600, 2000, 3))), 0, 255).astype(np.uint8)

@@ -28,6 +28,7 @@ def rooms(folder, *, count=20, operator=True, seed=0):
     return paths
 
 
+@pytest.mark.integration
 def test_whoever_carries_the_camera_is_found_across_the_seam(tmp_path):
     carried = find_carried(rooms(tmp_path))
     assert carried is not None
@@ -37,11 +38,13 @@ def test_whoever_carries_the_camera_is_found_across_the_seam(tmp_path):
     assert carried[~truth].mean() < 0.1  # what adjoins it
 
 
+@pytest.mark.integration
 def test_a_room_alone_hides_nothing(tmp_path):
     assert find_carried(rooms(tmp_path, operator=False)) is None
     assert find_carried(rooms(tmp_path, count=8)) is None  # too few to say
 
 
+@pytest.mark.integration
 def test_a_ceiling_that_looks_the_same_everywhere_stays(tmp_path):
     paths = rooms(tmp_path, operator=False)
     for path in paths:
@@ -63,6 +66,7 @@ def crop(paths, folder, *, rows=slice(60, 170), columns=slice(None)):
     return masks
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("columns", [slice(None), slice(100, 400)])
 def test_what_a_crop_leaves_black_moves_along_with_nobody(tmp_path, columns):
     paths = rooms(tmp_path, operator=False)
@@ -71,6 +75,7 @@ def test_what_a_crop_leaves_black_moves_along_with_nobody(tmp_path, columns):
     assert find_carried(paths) is not None  # it is the masks that tell
 
 
+@pytest.mark.integration
 def test_whoever_carries_the_camera_is_found_in_cropped_panoramas(tmp_path):
     paths = rooms(tmp_path)
     carried = find_carried(paths, crop(paths, tmp_path))
@@ -80,6 +85,7 @@ def test_whoever_carries_the_camera_is_found_in_cropped_panoramas(tmp_path):
     assert not carried[:, 40:-40].any()
 
 
+@pytest.mark.integration
 def test_a_few_masks_hide_nothing_of_the_others(tmp_path):
     paths = rooms(tmp_path)
     few = crop(rooms(tmp_path / "few", count=6), tmp_path, rows=slice(0, 40))

@@ -71,6 +71,7 @@ def test_photos_twice_as_wide_as_high_stay_photos(tmp_path):
         tmp_path / "a", [texture(128, 256, seed=seed, coarseness=32) for seed in range(9)])) == []
 
 
+@pytest.mark.integration
 def test_a_folder_is_used_as_what_it_holds_more_of(tmp_path):
     panoramas = photos(tmp_path / "a", [sphere(yaw) for yaw in range(5)])
     others = photos(tmp_path / "b", [texture(96, 128)] * 7)
@@ -96,6 +97,7 @@ def test_cylinders_are_no_panoramas_of_the_sphere(tmp_path):
         choose_projection("room", cylinders, "auto")
 
 
+@pytest.mark.integration
 def test_a_band_of_a_panorama_without_metadata_is_no_ordinary_photo(tmp_path):
     bands = photos(tmp_path / "a", [sphere(yaw)[30:100] for yaw in range(5)])
     with raises(InputError, 5, 0, "panoramas") as error:
@@ -108,6 +110,7 @@ def test_a_band_of_a_panorama_without_metadata_is_no_ordinary_photo(tmp_path):
     assert_facts(chosen.notices[0], 5, "panoramas", "left")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("rows", [16, 40, 60])
 def test_wide_photos_stay_photos(tmp_path, rows):
     wide = photos(tmp_path / "a", [

@@ -53,6 +53,7 @@ def cuts(sequence):
             if not len(tracks.matches(image - 1, image)[0])]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("stride", [1, 5, 10])  # steps of .01, .04 and .08 widths
 def test_a_walk_is_a_sequence_whatever_its_steps(stride):
     measured = measure_sequence(enumerate(walk(40 * stride)[::stride]), 40)
@@ -64,6 +65,7 @@ def test_a_walk_is_a_sequence_whatever_its_steps(stride):
     assert len(scan.tracks.names) == 40
 
 
+@pytest.mark.integration
 def test_photos_in_no_order_are_none_and_reading_them_soon_ends():
     taken = []
     order = np.random.default_rng(0).permutation(60)
@@ -73,6 +75,7 @@ def test_photos_in_no_order_are_none_and_reading_them_soon_ends():
     assert len(taken) < 20
 
 
+@pytest.mark.integration
 def test_frames_that_their_names_put_in_a_wrong_order_are_photos(tmp_path):
     frames = walk(40 * 40)[::40]
     order = np.random.default_rng(1).permutation(40)
@@ -109,6 +112,7 @@ def test_photos_taken_seconds_apart_are_no_frames(tmp_path, seconds, runs):
     assert len(list_runs(list_photos(tmp_path.iterdir()).photos)) == runs
 
 
+@pytest.mark.integration
 def test_photos_stored_on_their_side_give_the_tracks_of_upright_ones(tmp_path):
     tracks = {}
     for name, turned in (("upright", False), ("turned", True)):
@@ -120,6 +124,7 @@ def test_photos_stored_on_their_side_give_the_tracks_of_upright_ones(tmp_path):
     assert len(tracks["turned"].image) == pytest.approx(len(tracks["upright"].image), rel=0.05)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("name", "hidden", "follow"), [
     ("DSCF{:04d}.jpg", 0, True), ("DSCF{:04d}.jpg", 0.5, False), ("frame{:04d}.jpg", 0.5, True)])
 def test_photos_that_a_camera_named_are_frames_only_where_they_hardly_differ(
@@ -131,6 +136,7 @@ def test_photos_that_a_camera_named_are_frames_only_where_they_hardly_differ(
     assert (found(photos, tmp_path) is not None) is follow
 
 
+@pytest.mark.integration
 def test_two_walks_are_both_followed_and_nothing_from_one_to_the_other(tmp_path):
     write_photos(tmp_path / "walk", walk(30), name="a{}.jpg")
     photos = write_photos(tmp_path / "walk", walk(40, seed=1), name="b{}.jpg")
@@ -139,6 +145,7 @@ def test_two_walks_are_both_followed_and_nothing_from_one_to_the_other(tmp_path)
     assert cuts(sequence) == [30]
 
 
+@pytest.mark.integration
 def test_one_numbering_with_a_cut_in_it_is_both_sides_of_it(tmp_path):
     photos = write_photos(tmp_path / "walk", [*walk(30), *walk(40, seed=1)])
     sequence = found(photos, tmp_path)
@@ -148,12 +155,14 @@ def test_one_numbering_with_a_cut_in_it_is_both_sides_of_it(tmp_path):
     assert len(tracks.matches(29, 30)[0]) < 15 < len(tracks.matches(30, 31)[0])
 
 
+@pytest.mark.integration
 def test_a_camera_that_zooms_half_way_is_one_sequence(tmp_path):
     frames = walk(60)
     frames[30:] = [cv2.resize(gray[48:144, 64:192], (WIDTH, HEIGHT)) for gray in frames[30:]]
     assert found(write_photos(tmp_path / "walk", frames), tmp_path).places == tuple(range(60))
 
 
+@pytest.mark.integration
 def test_what_shows_another_scene_is_told_and_tracks_lead_past_it(tmp_path):
     frames = walk(60)
     frames[20:22] = walk(2, seed=1)
@@ -164,6 +173,7 @@ def test_what_shows_another_scene_is_told_and_tracks_lead_past_it(tmp_path):
     assert cuts(sequence) == []
 
 
+@pytest.mark.integration
 def test_a_photo_that_follows_no_other_but_shows_the_scene_stays(tmp_path):
     frames = walk(120)
     frames[20] = frames[110]
@@ -171,6 +181,7 @@ def test_a_photo_that_follows_no_other_but_shows_the_scene_stays(tmp_path):
     assert (sequence.strangers, sequence.places) == ((), tuple(range(120)))
 
 
+@pytest.mark.integration
 def test_a_photo_that_cannot_be_read_is_passed_over(tmp_path):
     photos = write_photos(tmp_path / "walk", walk(40))
     data = photos[7].path.read_bytes()
@@ -178,6 +189,7 @@ def test_a_photo_that_cannot_be_read_is_passed_over(tmp_path):
     assert found(photos, tmp_path).places == (*range(7), *range(8, 40))
 
 
+@pytest.mark.integration
 def test_a_sequence_comes_back_from_its_record_for_the_same_photos(tmp_path, monkeypatch):
     photos = write_photos(tmp_path / "walk", walk(40))
     first = found(photos, tmp_path)

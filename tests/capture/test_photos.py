@@ -233,6 +233,7 @@ def test_what_has_exif_or_the_size_of_others_is_not_odd(single):
     assert odd_photos(group_photos([shot("a"), shot("c", camera="Two"), single])) == []
 
 
+@pytest.mark.integration
 @given(st.lists(st.tuples(st.sampled_from([48, 64]), st.sampled_from(["", "One"])), max_size=8))
 def test_every_photo_is_in_one_group_and_names_differ(kinds):
     photos = [shot(str(k), width, camera=camera) for k, (width, camera) in enumerate(kinds)]

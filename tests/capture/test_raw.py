@@ -200,6 +200,7 @@ def test_real_raw_files_without_a_picture_are_named(shared_data, name):
     assert name in plan.broken[name]
 
 
+@pytest.mark.integration
 def test_views_of_a_real_scene_match_after_development(shared_data, tmp_path):
     folder = shared_data / "snowmiku_photos"
     truth, shots = [], []

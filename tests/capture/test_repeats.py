@@ -39,6 +39,7 @@ def repeat(frames, pattern):
 
 
 # 24 to 30, 24 to 60 and 30 to 60 frames a second; a screen recorded at 60 of what changes 10 times.
+@pytest.mark.integration
 @pytest.mark.parametrize("pattern", [[1, 1, 1, 2], [2, 3], [2], [6]])
 @pytest.mark.parametrize(("codec", "options"), [
     ("libx264", {"crf": "18"}), ("libx264", {"crf": "26"}), ("mpeg4", {"qmin": "5", "qmax": "5"})])
@@ -48,18 +49,21 @@ def test_repeats_of_a_walk_are_found_in_any_codec(tmp_path, codec, options, patt
     np.testing.assert_array_equal(stills_of(path), numbers)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("speed", [0.25, 0.5, 1])
 def test_a_slow_camera_shows_a_new_picture_in_each_frame(tmp_path, speed):
     path = write_video(tmp_path / "a.mp4", pan(speed, 30, noise=2), options={"crf": "23"})
     np.testing.assert_array_equal(stills_of(path), np.arange(30))
 
 
+@pytest.mark.integration
 def test_a_camera_that_creeps_shows_a_new_picture_when_it_has_moved_on(tmp_path):
     path = write_video(tmp_path / "a.mp4", pan(0.03, 80), options={"crf": "18"})
     # .12 pixels of 240 are the least shift: every fifth frame at the latest.
     assert 14 <= stills_of(path)[-1] <= 27
 
 
+@pytest.mark.integration
 def test_a_camera_at_rest_shows_one_picture_for_as_long_as_it_rests(tmp_path):
     walk = pan(2, 20, noise=3)
     rest = [np.clip(walk[9] + np.random.default_rng(i).normal(0, 3, walk[9].shape), 0, 255)
@@ -71,6 +75,7 @@ def test_a_camera_at_rest_shows_one_picture_for_as_long_as_it_rests(tmp_path):
     assert stills[-1] == 19
 
 
+@pytest.mark.integration
 def test_what_moves_before_a_camera_at_rest_makes_no_new_picture(tmp_path):
     still = pan(2, 1)[0]
     frames = [still.copy() for _ in range(20)]
@@ -80,6 +85,7 @@ def test_what_moves_before_a_camera_at_rest_makes_no_new_picture(tmp_path):
     assert stills_of(path)[-1] == 0
 
 
+@pytest.mark.integration
 def test_something_fixed_to_the_camera_does_not_hide_that_it_moves(tmp_path):
     frames = pan(2, 20)
     for frame in frames:

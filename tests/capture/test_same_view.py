@@ -80,6 +80,7 @@ def test_the_sharpest_of_a_group_stays_and_the_first_of_equals():
     assert found[0].name is None
 
 
+@pytest.mark.integration
 def test_a_chain_of_small_steps_is_not_one_group():
     chain = [measure_photo(moved(photo(1), 0.0015 * step)) for step in range(30)]
     goes = find_repeats(chain)
@@ -133,6 +134,7 @@ def test_another_lamp_makes_another_view():
     assert not is_same_view(measure_photo(photo(1)), measure_photo(relit(photo(1))))
 
 
+@pytest.mark.integration
 def test_steps_of_a_walk_whose_exposure_drifts_are_not_one_view():
     walk = [measure_photo(exposed(moved(photo(1), 0.004 * step), 0.1 * (step % 7)))
             for step in range(40)]

@@ -52,6 +52,7 @@ def test_sharpness_is_measured_at_one_size():
     assert measure_sharpness(larger) == pytest.approx(measure_sharpness(gray), rel=1e-6)
 
 
+@pytest.mark.integration
 def test_an_undamaged_video_is_whole(video):
     steps = []
     scan = scan_video(video, threads=2, step=lambda: steps.append(1))
@@ -61,6 +62,7 @@ def test_an_undamaged_video_is_whole(video):
     assert decode_threads(scan, 4) == 4
 
 
+@pytest.mark.integration
 def test_a_container_without_a_count_is_checked_by_its_duration(tmp_path):
     path = write_video(tmp_path / "walk.mkv", walk())
     assert scan_video(path, threads=1, step=quiet).declared == 40
@@ -80,6 +82,7 @@ def assert_equal(ours, theirs):
             np.testing.assert_array_equal(value, getattr(theirs, name))
 
 
+@pytest.mark.integration
 def test_a_scan_is_read_as_it_was_written(video, tmp_path):
     scan = scan_video(video, threads=1, step=quiet)
     scan.motion[3] = np.nan
@@ -92,6 +95,7 @@ def test_a_scan_is_read_as_it_was_written(video, tmp_path):
     assert_equal(Scan.read(tmp_path / "scan.json"), scan)
 
 
+@pytest.mark.integration
 def test_an_overlay_hides_neither_motion_nor_blur(tmp_path):
     """Beside a sharp picture that stays, a plain scene moves, and is blurred in one frame."""
     frames = [np.full((96, 160, 3), 128, np.uint8) for _ in range(20)]
@@ -111,6 +115,7 @@ def test_an_overlay_hides_neither_motion_nor_blur(tmp_path):
     assert scan.sharpness[10] < .2 * np.median(scan.sharpness)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("erase", [False, True])
 @pytest.mark.parametrize("packet", [1, 4, 13, 22, 35])
 def test_whole_frames_are_exactly_those_of_the_undamaged_video(video, packet, erase):
@@ -130,6 +135,7 @@ def test_whole_frames_are_exactly_those_of_the_undamaged_video(video, packet, er
     assert decode_threads(scan, 4) == 1
 
 
+@pytest.mark.integration
 def test_damage_is_told_alike_by_any_number_of_threads(video):
     spoil_packets(video, [5, 24])
     scans = [scan_video(video, threads=threads, step=quiet) for threads in (1, 2, 4)]
@@ -162,6 +168,7 @@ def test_a_video_without_one_frame_that_decodes_names_its_codec(video):
 
 
 # (first second, seconds) of each part that is shown; groups begin at whole seconds.
+@pytest.mark.integration
 @pytest.mark.parametrize(("edits", "shown"), [
     ([(0, 2)], range(20)), ([(1.5, 2.5)], range(15, 40)), ([(1.3, 1.7)], range(13, 30)),
     ([(1, 9)], range(10, 40)), ([(None, 1), (1, 2)], range(10, 30)),
@@ -177,6 +184,7 @@ def test_what_an_edit_list_leaves_out_is_not_lost(video, edits, shown, threads):
         np.testing.assert_array_equal(rgb, whole[shown[index]])
 
 
+@pytest.mark.integration
 def test_damage_within_an_edit_list_is_still_seen(video):
     set_edit_list(video, [(1, 2)])
     spoil_packets(video, [7], erase=True)
@@ -192,6 +200,7 @@ def test_an_edit_list_that_shows_nothing_is_named(video):
     assert "-ignore_editlist 1" in told.value.hint
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
 def test_places_of_an_avi_that_repeat_a_frame_are_not_lost(tmp_path, codec):
     path = tmp_path / "screen.avi"
@@ -212,6 +221,7 @@ def test_places_of_an_avi_that_repeat_a_frame_are_not_lost(tmp_path, codec):
     assert scan_video(path, threads=1, step=quiet).lost > 0
 
 
+@pytest.mark.integration
 def test_half_a_file_gives_the_frames_of_its_half(tmp_path):
     path = write_video(tmp_path / "walk.ts", walk())
     data = path.read_bytes()
@@ -316,6 +326,7 @@ def stroll(count, *, seed):
     return [wall[:, 4 * step:4 * step + 256] for step in range(count)]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("parts", "size"), [
     (((12, 128, 96), (6, 256, 192)), (128, 96)), (((6, 256, 192), (12, 128, 96)), (128, 96))])
 def test_frames_of_another_size_are_scaled_to_the_most_common_one(tmp_path, parts, size):
@@ -334,6 +345,7 @@ def test_frames_of_another_size_are_scaled_to_the_most_common_one(tmp_path, part
         assert index == np.argmax([cv2.PSNR(rgb, other) for other in alone])
 
 
+@pytest.mark.integration
 def test_times_in_the_order_of_packets_lose_no_frame(tmp_path):
     path = tmp_path / "a.ts"  # as programs that know no B-frames write
     clip = write_video(tmp_path / "b.ts", stroll(20, seed=0), options={"qp": "4", "bf": "3"})
@@ -362,6 +374,7 @@ def test_frames_of_another_shape_are_left_out_and_named(tmp_path, first):
     assert_facts("\n".join(scan.notices), 6, "96x128")
 
 
+@pytest.mark.integration
 def test_the_size_is_kept_with_a_scan(tmp_path):
     scan = scan_video(joined(tmp_path / "a.ts", (3, 256, 192), (6, 128, 96)), threads=1,
                       step=lambda: None)

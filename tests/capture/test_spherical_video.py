@@ -72,6 +72,7 @@ def test_metadata_tell_the_projection(plain):
     assert not is_spherical(plain, 128, 64, 5, "perspective")
 
 
+@pytest.mark.integration
 def test_a_video_that_wraps_around_is_spherical(tmp_path):
     path = write_video(
         tmp_path / "walk.mp4", [sphere(0.02 * index) for index in range(130)])
@@ -202,6 +203,7 @@ def test_views_that_are_woven_together_are_refused(tmp_path):
         next(decode(path, threads=1))
 
 
+@pytest.mark.integration
 def test_two_views_without_a_tag_are_refused_with_the_way_to_cut_one_out(tmp_path):
     path = write_one(tmp_path / "a.mp4", [both_eyes(seed) for seed in range(6)])
     with raises(InputError, "view") as error:
@@ -210,12 +212,14 @@ def test_two_views_without_a_tag_are_refused_with_the_way_to_cut_one_out(tmp_pat
     refuse_unusable(path, "perspective")
 
 
+@pytest.mark.integration
 def test_two_circles_are_refused(tmp_path):
     path = write_one(tmp_path / "a.mp4", [two_circles(seed) for seed in range(6)])
     with raises(InputError, "fisheye", "lenses"):
         refuse_unusable(path, "auto")
 
 
+@pytest.mark.integration
 def test_frames_of_one_view_are_not_refused(tmp_path):
     refuse_unusable(
         write_one(tmp_path / "a.mp4", [view(seed, width=640) for seed in range(6)]), "auto")

@@ -29,6 +29,7 @@ def test_plain_pictures_agree_with_none():
     assert count_agreeing(plain, plain) == 0
 
 
+@pytest.mark.integration
 def test_only_what_no_other_shows_is_a_stranger_and_what_cannot_be_read_is_none():
     pictures = {0: scene(0), 1: scene(0, shift=60), 2: scene(1), 3: scene(0, shift=120), 4: None}
     assert find_strangers([2, 3, 4], [0, 1], pictures.get) == [2]

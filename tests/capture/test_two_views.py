@@ -39,6 +39,7 @@ def two_circles(seed, *, side=240, axis=1):
         view(seed + eye, width=side, height=side) * inside[..., None] for eye in (0, 100)], axis)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("squeezed", [False, True])
 @pytest.mark.parametrize("packing", [SIDE_BY_SIDE, TOP_AND_BOTTOM])
 def test_the_views_of_both_eyes_are_told(packing, squeezed):
@@ -54,6 +55,7 @@ def test_pictures_that_show_nothing_tell_nothing():
     assert find_two_views([]) is None
 
 
+@pytest.mark.integration
 def test_an_ordinary_picture_is_one_view():
     assert find_two_views([view(seed, width=640) for seed in range(3)]) is None
     assert find_two_views([both_eyes(1), view(2, width=640)]) is None
@@ -87,6 +89,7 @@ def save(folder, pictures, suffix=".jpg"):
     return list_photos(sorted(folder.iterdir()), folder).photos
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("suffix", "camera"), [
     (".insp", "auto"), (".jpg", "auto"), (".jpg", "equirectangular")])
 def test_photos_of_two_fisheyes_are_refused(tmp_path, suffix, camera):
@@ -97,6 +100,7 @@ def test_photos_of_two_fisheyes_are_refused(tmp_path, suffix, camera):
     assert len(choose_projection("a", photos, "perspective").photos) == 4
 
 
+@pytest.mark.integration
 def test_3d_photos_are_refused(tmp_path):
     photos = save(tmp_path / "a", {f"f{seed}": both_eyes(seed) for seed in range(4)})
     with raises(InputError, "views", "both") as error:

@@ -45,6 +45,7 @@ def config_of(stage: str, workspace: str = "workspace") -> dict[str, object]:
     return json.loads((Path(workspace) / stage / "manifest.json").read_text())["config"]
 
 
+@pytest.mark.integration
 def test_each_verb_runs_its_stage_and_says_what_came_of_it(capsys: Said) -> None:
     for words in (["ingest", "room.mp4"], ["denoise"], ["sfm"], ["train"], ["prune"], ["eval"],
                   ["export"]):
@@ -59,6 +60,7 @@ def test_each_verb_runs_its_stage_and_says_what_came_of_it(capsys: Said) -> None
     assert fake_stages.ran[len(NAMES):] == ["train"]
 
 
+@pytest.mark.integration
 def test_run_does_everything_and_ends_with_its_results(capsys: Said) -> None:
     assert main(["run", "room.mp4", "--set", "train.iterations=9"]) == 0
     assert fake_stages.ran == [*NAMES, PAGE]
@@ -71,6 +73,7 @@ def test_run_does_everything_and_ends_with_its_results(capsys: Said) -> None:
     assert fake_stages.ran == [*NAMES, PAGE]
 
 
+@pytest.mark.integration
 def test_eval_prints_its_table_and_what_the_scores_mean_only_where_asked(capsys: Said) -> None:
     assert main(["run", "room.mp4", "--no-prune"]) == 0
     capsys.readouterr()
@@ -90,6 +93,7 @@ def test_run_can_leave_pruning_out() -> None:
     assert fake_stages.ran == [*(name for name in NAMES if name != "prune"), PAGE]
 
 
+@pytest.mark.integration
 def test_demo_runs_on_the_bundled_video_in_a_workspace_of_its_own(
     capsys: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +168,7 @@ def test_the_workspace_is_the_option_or_the_variable_or_a_folder_here(
                for name in ("workspace", "two", "three"))
 
 
+@pytest.mark.integration
 def test_status_shows_state_and_reason(capsys: Said) -> None:
     main(["run", "room.mp4"])
     Path("workspace/recon.toml").write_text("[train]\niterations = 7\n")
@@ -286,6 +291,7 @@ def test_verbose_shows_the_traceback(capsys: Said) -> None:
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.integration
 def test_clean_keeps_every_finished_result_fresh(
     capsys: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,12 +311,14 @@ def test_clean_keeps_every_finished_result_fresh(
     assert states() == ["fresh"] * len([*NAMES, PAGE])
 
 
+@pytest.mark.integration
 def test_clean_keeps_small_logs() -> None:
     main(["run", "room.mp4"])
     assert main(["clean"]) == 0
     assert Path("workspace/train/log.jsonl").exists()
 
 
+@pytest.mark.integration
 def test_clean_removes_the_results_of_named_stages(capsys: Said) -> None:
     main(["run", "room.mp4"])
     capsys.readouterr()

@@ -31,6 +31,7 @@ def _recon(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
         capture_output=True, text=True, check=False)
 
 
+@pytest.mark.integration
 def test_completion_gives_a_script_and_the_verbs() -> None:
     script = _recon(_RECON_COMPLETE="zsh_source")
     assert script.returncode == 0
@@ -39,6 +40,7 @@ def test_completion_gives_a_script_and_the_verbs() -> None:
     assert words.stdout == "plain,status\n"
 
 
+@pytest.mark.integration
 def test_a_reader_that_goes_away_is_no_error() -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "recon_cli", "status"], stdout=subprocess.PIPE,
@@ -55,6 +57,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
 SLOW = {"torch", "numba", "cv2", "pycolmap", "scipy", "skimage", "viser", "matplotlib"}
 
 
+@pytest.mark.integration
 def test_status_and_help_import_nothing_slow() -> None:
     code = f"""
 import sys
@@ -103,6 +106,7 @@ def _shell(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
         env={**os.environ, **environment}, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.integration
 @_posix
 @pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&-", ">&- 2>&- <&-"])
 def test_a_closed_stream_is_no_error(closed: str) -> None:
@@ -111,6 +115,7 @@ def test_a_closed_stream_is_no_error(closed: str) -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.integration
 @_posix
 def test_no_file_gets_the_number_of_a_closed_stream() -> None:
     """What a library prints on number 2 would else end in the file that has it."""
@@ -124,6 +129,7 @@ def test_no_file_gets_the_number_of_a_closed_stream() -> None:
     assert Path("data").read_bytes() == b""
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
 @pytest.mark.parametrize("words", ["status", "status --json", "clean --json", "--help"])
 def test_a_full_standard_output_is_told_from_a_full_workspace(words: str) -> None:
@@ -134,6 +140,7 @@ def test_a_full_standard_output_is_told_from_a_full_workspace(words: str) -> Non
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.integration
 @_posix
 def test_a_current_folder_that_is_gone_is_said_but_help_is_given() -> None:
     done = _shell("mkdir gone; cd gone; rmdir ../gone; $RECON status", PYTHONPATH=str(ROOT))
@@ -144,6 +151,7 @@ def test_a_current_folder_that_is_gone_is_said_but_help_is_given() -> None:
     assert done.returncode == 0
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems ignore ulimit -v")
 @pytest.mark.parametrize("limit_kb", [80_000, 300_000])
 def test_too_little_address_space_is_said_before_a_library_ends_the_process(limit_kb: int) -> None:
@@ -153,6 +161,7 @@ def test_too_little_address_space_is_said_before_a_library_ends_the_process(limi
     assert _shell(f"ulimit -v {limit_kb}; $RECON status").returncode == 0
 
 
+@pytest.mark.integration
 @_posix
 def test_a_user_without_a_home_is_told_to_name_a_folder_for_kernels() -> None:
     code = """

@@ -39,6 +39,7 @@ def as_json(text):
     return json.loads(text[text.index("{"):])
 
 
+@pytest.mark.integration
 def test_models_of_workspaces_stand_in_one_table_with_what_each_scored_alone(room, capsys):
     found = as_json(compared(capsys, room / "a", room / "b", "--form", "json"))
     assert [(one["workspace"], one["model"]) for one in found["models"]] == [
@@ -49,6 +50,7 @@ def test_models_of_workspaces_stand_in_one_table_with_what_each_scored_alone(roo
         assert one["gaussians"] == alone["models"][one["model"]]["gaussians"]
 
 
+@pytest.mark.integration
 def test_models_of_one_capture_are_paired_with_the_first(room, capsys):
     found = as_json(compared(capsys, room / "a", room / "b", "--form", "json"))
     first, second, third = found["models"]
@@ -59,6 +61,7 @@ def test_models_of_one_capture_are_paired_with_the_first(room, capsys):
         assert one["psnr_db"]["low"] <= one["psnr_db"]["mean"] <= one["psnr_db"]["high"]
 
 
+@pytest.mark.integration
 def test_models_of_two_captures_are_not_paired_though_their_views_have_the_same_names(
     room, capsys
 ):
@@ -68,6 +71,7 @@ def test_models_of_two_captures_are_not_paired_though_their_views_have_the_same_
     assert found["differences"] == []
 
 
+@pytest.mark.integration
 def test_a_file_scores_what_the_workspace_it_came_from_scores(room, tmp_path, capsys):
     copy = tmp_path / "handed out.ply"
     copy.write_bytes((room / "a" / "prune" / "splats.ply").read_bytes())
@@ -80,6 +84,7 @@ def test_a_file_scores_what_the_workspace_it_came_from_scores(room, tmp_path, ca
     assert file["truth_digest"] == pruned["truth_digest"]
 
 
+@pytest.mark.integration
 def test_a_file_that_was_handed_out_in_another_frame_scores_the_same(room, tmp_path, capsys):
     out = shutil.copytree(room / "a", tmp_path / "turned")
     assert main(["export", "-w", str(out), "--up", "y", "--backdrop", "keep"]) == 0
@@ -92,6 +97,7 @@ def test_a_file_that_was_handed_out_in_another_frame_scores_the_same(room, tmp_p
     assert "transform.json" in capsys.readouterr().err
 
 
+@pytest.mark.integration
 def test_paths_of_one_name_are_told_apart_in_every_table(room, tmp_path, capsys):
     twin = tmp_path / "a"
     shutil.copytree(room / "b", twin)
@@ -103,6 +109,7 @@ def test_paths_of_one_name_are_told_apart_in_every_table(room, tmp_path, capsys)
     assert len(means) == 3
 
 
+@pytest.mark.integration
 def test_each_workspace_keeps_to_its_own_settings(room, tmp_path, capsys, monkeypatch):
     (tmp_path / "workspace").mkdir()
     (tmp_path / "workspace" / "recon.toml").write_text("[train]\niterations = 7\n")
@@ -115,6 +122,7 @@ def test_each_workspace_keeps_to_its_own_settings(room, tmp_path, capsys, monkey
     assert metrics["width"] == 20
 
 
+@pytest.mark.integration
 def test_every_form_holds_the_figures(room, capsys):
     found = as_json(compared(capsys, room / "a", "--form", "json"))
     shown = f"{found['models'][0]['psnr_db']:.2f}"
@@ -130,6 +138,7 @@ def test_every_form_holds_the_figures(room, capsys):
     assert float(means[0]["psnr_db"]) == pytest.approx(found["models"][0]["psnr_db"], abs=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("make", "code", "words"), [
     (lambda folder: folder / "nowhere", 3, "does not exist"),
     (lambda folder: folder, 3, "neither a workspace"),
@@ -141,6 +150,7 @@ def test_what_is_no_model_is_refused_before_anything_runs(
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.integration
 def test_a_file_that_is_no_splats_a_twin_and_a_workspace_without_cameras_are_refused(
     room, tmp_path, capsys
 ):

@@ -72,6 +72,7 @@ def test_an_address_is_refused_from_python_as_well(tmp_path):
     assert not (tmp_path / "ws").exists()
 
 
+@pytest.mark.integration
 def test_view_says_what_it_opens_before_it_imports_what_draws(tmp_path):
     scene = tmp_path / "scene.ply"
     scene.write_bytes(b"ply")

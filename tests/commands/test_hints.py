@@ -105,6 +105,7 @@ def named_commands(tree: ast.AST) -> list[tuple[int, str]]:
     return found
 
 
+@pytest.mark.integration
 def test_every_command_that_is_named_is_one_that_recon_understands() -> None:
     wrong, count = [], 0
     for path in sorted(PACKAGE.rglob("*.py")):
@@ -123,6 +124,7 @@ def test_every_command_that_is_named_is_one_that_recon_understands() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.integration
 def test_no_hint_is_text_with_a_command_that_needs_the_workspace() -> None:
     wrong = []
     for path in sorted(PACKAGE.rglob("*.py")):

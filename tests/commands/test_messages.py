@@ -7,6 +7,8 @@ import subprocess
 import sys
 import termios
 
+import pytest
+
 SAYS = """
 import logging
 from recon_cli.commands import console
@@ -36,12 +38,14 @@ def shown(*, terminal):
     return [line.rstrip().rsplit("\r", 1)[-1] for line in lines]
 
 
+@pytest.mark.integration
 def test_a_message_takes_the_bars_place_on_a_terminal_and_the_bar_goes_on_below():
     lines = shown(terminal=True)
     place = lines.index("notice: a frame is dark")
     assert "10/10" in lines[place + 1]
 
 
+@pytest.mark.integration
 def test_without_a_terminal_nothing_is_drawn_over():
     text = "\n".join(shown(terminal=False))
     assert re.search(r"^[-\d]{10} [:\d]{8} notice: a frame is dark$", text, re.MULTILINE)

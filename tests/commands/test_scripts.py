@@ -59,6 +59,7 @@ def test_every_verb_is_told_how_to_talk_and_each_option_has_a_variable_of_its_ow
     assert "-h, --help" in capsys.readouterr().out
 
 
+@pytest.mark.integration
 def test_without_a_terminal_each_line_of_the_log_has_the_time(capsys: Said) -> None:
     assert main(["run", "room.mp4"]) == 0
     err = capsys.readouterr().err
@@ -168,6 +169,7 @@ def test_a_variable_counts_as_a_typed_option_which_wins_over_it(
     assert json.loads(capsys.readouterr().out)["stages"][3]["state"] == "fresh"
 
 
+@pytest.mark.integration
 def test_the_workspace_keeps_its_variable_and_a_list_has_spaces_between(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

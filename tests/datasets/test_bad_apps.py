@@ -355,6 +355,7 @@ def test_a_packed_recording_that_is_damaged_is_refused(frames, tmp_path):
         assert not (tmp_path / "out" / "unpacked").exists()
 
 
+@pytest.mark.integration
 def test_a_bomb_is_refused_before_it_is_unpacked(frames, tmp_path):
     path = tmp_path / "bomb.r3d"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -382,6 +383,7 @@ def test_a_recording_with_a_name_that_leads_out_is_refused(frames, tmp_path, nam
     assert set(tmp_path.rglob("*")) - before == {tmp_path / "out"}
 
 
+@pytest.mark.integration
 def test_a_stream_that_unpacks_to_something_else_is_refused(frames, tmp_path):
     import lzfse
 

@@ -83,6 +83,7 @@ def test_depth_in_no_usual_unit_is_not_used_and_the_factor_named(taken, off):
     assert said == pytest.approx(off, rel=0.1)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("change", "words"), [
     (lambda depth: depth[::-1], "upside down"),
     (lambda depth: depth[:, ::-1], "left and right swapped")])
@@ -106,6 +107,7 @@ def test_points_of_the_set_tell_the_unit_where_cameras_do_not_move(taken):
     assert not fit_depth(still).shown
 
 
+@pytest.mark.integration
 def test_depth_that_fits_better_the_farther_it_is_is_not_accused(taken):
     """On a sphere around each camera no motion shows, once the sphere is large."""
     def on_a_sphere(depth):
@@ -115,6 +117,7 @@ def test_depth_that_fits_better_the_farther_it_is_is_not_accused(taken):
     assert not fit_depth(posed(taken, on_a_sphere)).shown
 
 
+@pytest.mark.integration
 def test_poses_of_another_walk_are_told_from_a_wrong_unit(taken):
     images = posed(taken, lambda depth: depth)
     rng = np.random.default_rng(1)
@@ -127,6 +130,7 @@ def test_poses_of_another_walk_are_told_from_a_wrong_unit(taken):
     assert fit.contradicts or not fit.fault
 
 
+@pytest.mark.integration
 def test_without_motion_or_readable_depth_nothing_is_said(taken):
     images = posed(taken, lambda depth: depth / 10)
     still = [dataclasses.replace(image, viewmat=images[0].viewmat) for image in images]
@@ -136,6 +140,7 @@ def test_without_motion_or_readable_depth_nothing_is_said(taken):
         assert (fit.factor, fit.shown, fit.fault) == (1, False, "")
 
 
+@pytest.mark.integration
 def test_depth_of_a_real_phone_is_used_as_it_is(shared_data):
     fit = fit_depth(read_posed(shared_data / "record3d_door").images)
     assert (fit.factor, fit.fault) == (1, "")

@@ -90,6 +90,7 @@ def test_an_image_that_is_gone_is_named(posed):
         points_from_depth(posed)
 
 
+@pytest.mark.integration
 def test_points_of_a_room_lie_on_the_surfaces_that_other_views_see(shared_data):
     posed = read_replica(shared_data / "rooms" / "office")
     points, _ = points_from_depth(posed)

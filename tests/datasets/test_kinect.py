@@ -152,6 +152,7 @@ def test_a_pose_of_a_frames_own_time_counts_however_far_others_are(tmp_path, apa
             image.viewmat @ posed_sets.pose(number), np.eye(4), atol=1e-6)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("interval", "count"), [(0.02, 9), (0.1, 9), (0.2, 9), (1.0, 4)])
 def test_between_poses_the_usual_interval_tells_a_gap(tmp_path, interval, count):
     """Frames lie in the middle between poses; five intervals of them are missing before the 5th.

@@ -114,6 +114,7 @@ def test_a_folder_where_a_file_belongs_is_a_typed_error(tmp_path):
         read_posed(tmp_path)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("room", "words"), [
     ("rooms/office", "a Replica sequence (NICE-SLAM layout): 100 frames, 20 with depth, "
      "12 held-out views"),

@@ -52,6 +52,7 @@ def write_depth(folder, frames, *, bottom_first=False, swapped=False, far=np.inf
     (folder / f"{eye}_depth_descriptors.csv").write_text("\n".join(lines) + "\n")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("more", [
     {}, {"bottom_first": True}, {"swapped": True}, {"bottom_first": True, "swapped": True},
     {"far": 30.0}])

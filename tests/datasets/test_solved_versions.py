@@ -45,6 +45,7 @@ def angles(pose):
     return best.x
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("columns", [
     "name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
     "f,name,roll,pitch,heading,alt,y,x", "#cameras 5\n#name,x,y,alt,heading,pitch,roll,f,px,py"])

@@ -325,6 +325,7 @@ def nodes(value):
             yield from nodes(value[key])
 
 
+@pytest.mark.integration
 def test_whatever_stands_in_a_place_of_the_file_is_read_or_refused(tmp_path):
     posed_sets.make_transforms(tmp_path)
     value = posed_sets.transforms(

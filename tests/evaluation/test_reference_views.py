@@ -1,6 +1,7 @@
 """Scores of views by any number of threads, and images that are not rendered twice."""
 
 import numpy as np
+import pytest
 import torch
 
 from recon_cli.evaluation import reference_views
@@ -19,6 +20,7 @@ def scatter(count=40) -> Splats:
         sh_dc=torch.randn(count, 3, generator=generator), sh_rest=torch.zeros(count, 0, 3))
 
 
+@pytest.mark.integration
 def test_any_number_of_threads_gives_the_same_scores_in_the_order_of_the_views():
     splats = scatter()
     rng = np.random.default_rng(0)

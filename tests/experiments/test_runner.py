@@ -49,6 +49,7 @@ def test_the_clock_stands_still_in_its_pauses(monkeypatch: pytest.MonkeyPatch) -
     assert clock.seconds() == (3.0, 4.5)
 
 
+@pytest.mark.integration
 def test_looking_changes_nothing_about_a_run(tiny: ExperimentScene) -> None:
     run = TrainingRun(REFERENCE, BASE, 40, 0)
     often = run_trial(tiny, run, range(0, 41, 5), on_step=nothing)
@@ -68,6 +69,7 @@ def test_every_step_is_reported_once(tiny: ExperimentScene) -> None:
     assert len(steps) == 30
 
 
+@pytest.mark.integration
 def test_the_arm_of_the_paper_removes_its_share_at_two_thirds(tiny: ExperimentScene) -> None:
     assert PAPER.prune
     assert (PAPER.prune.config.ratio, PAPER.prune.config.score) == (0.6, "paper")

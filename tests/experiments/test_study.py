@@ -112,6 +112,7 @@ def test_arms_whose_steps_grow_dearer_still_take_the_same_seconds(
     assert made.count(("budget", 40, 0)) == 1  # the guess
 
 
+@pytest.mark.integration
 def test_arms_take_the_steps_that_fit_into_the_seconds_of_the_slowest(scene, made, tmp_path):
     studied = work(tmp_path / "out", seeds=1).run_scene(scene)
     expected = {"reference": 20, "paper": 25, "budget": 40, "budget-pruned": 50}
@@ -124,6 +125,7 @@ def test_arms_take_the_steps_that_fit_into_the_seconds_of_the_slowest(scene, mad
     assert len(made) == 7
 
 
+@pytest.mark.integration
 def test_steps_at_equal_seconds_stay_fixed_when_seeds_are_added(
     scene, made, tmp_path, monkeypatch
 ):
@@ -134,6 +136,7 @@ def test_steps_at_equal_seconds_stay_fixed_when_seeds_are_added(
     assert [one[2] for one in made] == [0] * 7 + [1] * 7
 
 
+@pytest.mark.integration
 def test_the_seconds_that_are_made_equal_can_be_chosen(scene, made, tmp_path):
     for clock in ("wall", "cpu"):
         work(tmp_path / "out", seeds=1, clock=clock).run_scene(scene)
@@ -281,6 +284,7 @@ def test_an_interrupted_study_says_so(studied, tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "new" / "study.json").exists()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("words", "code", "said"), [
     ([], 2, "No scene was given"),
     (["--scenes", "nothing"], 3, "does not exist"),

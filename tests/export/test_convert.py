@@ -144,6 +144,7 @@ def _write_doubles(path: Path, splats: Splats, means: torch.Tensor) -> Path:
     return path
 
 
+@pytest.mark.integration
 def test_the_scene_is_reduced_as_asked(tmp_path: Path) -> None:
     source = ply(tmp_path / "a.ply", replace(room(400), backdrop=BACKDROP))
     fewer = run(source, tmp_path / "b.ply", max_gaussians=100, sh_degree=1)
@@ -176,6 +177,7 @@ def made() -> Splats:
         torch.logit(opacities), torch.zeros(404, 3), torch.zeros(0, 0, 3))
 
 
+@pytest.mark.integration
 def test_without_views_the_invisible_haze_and_what_is_alone_are_floaters(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -289,6 +291,7 @@ def test_one_gaussian_before_every_camera_is_drawn_over_nothing(tmp_path: Path) 
         1, abs=0.05)
 
 
+@pytest.mark.integration
 def test_problems_on_reading_and_far_scenes_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

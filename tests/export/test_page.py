@@ -48,6 +48,7 @@ def ring(count: int = 40, tilt: float = 0.0) -> list[Camera]:
     return cameras
 
 
+@pytest.mark.integration
 def test_a_tour_knows_that_views_beside_have_seen_more_and_none_above():
     tour = plan_tour(box(), ring(), CONTEXT)
     assert tour is not None
@@ -59,6 +60,7 @@ def test_a_tour_knows_that_views_beside_have_seen_more_and_none_above():
     assert tour.margins.min() >= 1
 
 
+@pytest.mark.integration
 def test_the_picture_of_a_page_has_the_shape_of_a_preview():
     tour = plan_tour(box(), ring(), CONTEXT)
     assert tour is not None

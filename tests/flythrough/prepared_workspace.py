@@ -18,6 +18,7 @@ from recon_cli.scene.splats import Splats
 from recon_cli.splats.ply import write_ply
 from recon_cli.stages import STAGES
 from recon_cli.train.fit.train_data import write_config
+from recon_cli.workspace.atomic import write_json
 from recon_cli.workspace.layout import Workspace
 
 TABLE = tuple(replace(row, module="prepared_workspace", renders=False) for row in STAGES)
@@ -31,6 +32,7 @@ def run(config, inputs, out, ctx):  # noqa: ARG001 - the signature of a stage
         shutil.copytree(source, out, dirs_exist_ok=True)
     if out.name == "place":
         world = replace(summaries.WORLD, evidence=replace(summaries.EVIDENCE, **evidence))
+        write_json(out / "world.json", world.to_json())
         return replace(summaries.PLACE, world=world)
     return summaries.BY_STAGE[out.name]
 

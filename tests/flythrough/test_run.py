@@ -13,6 +13,7 @@ from recon_cli.flythrough import run as running
 from recon_cli.io.images import read_image
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("backend", ["torch", "numba"])
 def test_a_view_is_to_the_bit_what_eval_renders(copied, tmp_path, backend):
     assert main(["eval", "-w", str(copied), "--backend", backend, "--threads", "1"]) == 0

@@ -58,6 +58,7 @@ def test_rigs_and_frames_cut_short_anywhere_are_damaged(tmp_path, name, share):
         read_colmap(tmp_path)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("value", [0, 127, 255])
 def test_whatever_stands_in_a_byte_is_read_or_refused(tmp_path, name, value):

@@ -83,6 +83,7 @@ def test_without_points_nothing_proves_the_order(folder):
         read_colmap(folder)
 
 
+@pytest.mark.integration
 def test_a_real_model_without_names_is_read(shared_data):
     posed = read_colmap(shared_data / "desk_monitors")
     assert len(posed.images) == 70

@@ -49,6 +49,7 @@ def starts(tmp_path):
     return len((tmp_path / "starts").read_text())
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("stand_in")
 @pytest.mark.parametrize("code", [0, 3])
 def test_the_exit_code_comes_back_and_what_was_printed_is_in_the_log(tmp_path, code):
@@ -57,6 +58,7 @@ def test_the_exit_code_comes_back_and_what_was_printed_is_in_the_log(tmp_path, c
     assert starts(tmp_path) == 1
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("stand_in")
 @pytest.mark.parametrize("how", ["die-once", "end-once"])
 def test_a_command_whose_process_was_killed_is_run_again(tmp_path, how):
@@ -64,6 +66,7 @@ def test_a_command_whose_process_was_killed_is_run_again(tmp_path, how):
     assert starts(tmp_path) == 2
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("stand_in")
 def test_a_command_that_is_always_killed_is_given_up_with_the_code_of_a_shell(tmp_path):
     assert LocalExecutor(1).run(command(tmp_path, "die")) == 128 + signal.SIGKILL
@@ -77,6 +80,7 @@ def run_in_thread(local, given):
     return thread, codes
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("stand_in")
 def test_a_command_that_is_stopped_saves_what_it_has_and_none_starts_afterwards(tmp_path):
     local = LocalExecutor(1)
@@ -91,6 +95,7 @@ def test_a_command_that_is_stopped_saves_what_it_has_and_none_starts_afterwards(
     assert starts(tmp_path) == 1
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("stand_in")
 def test_a_command_waits_for_a_process_that_still_holds_the_workspace(tmp_path):
     (tmp_path / "scene").mkdir()

@@ -65,6 +65,7 @@ def children(*, alive: bool) -> list[psutil.Process]:
 needs_shell = pytest.mark.skipif(sys.platform == "win32", reason="the process is a shell script")
 
 
+@pytest.mark.integration
 @needs_shell
 def test_the_process_ends_with_the_stages_even_where_they_fail(tmp_path, worker):
     worker("exec sleep 60")
@@ -81,6 +82,7 @@ def test_the_process_ends_with_the_stages_even_where_they_fail(tmp_path, worker)
     assert not started[0].is_running()
 
 
+@pytest.mark.integration
 @needs_shell
 def test_a_failure_goes_to_the_log_and_not_to_the_terminal(tmp_path, worker, caplog, capfd):
     worker("echo out of memory >&2; exit 3")

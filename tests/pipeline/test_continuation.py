@@ -40,6 +40,7 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.integration
 def test_more_steps_go_on_from_the_finished_run_and_are_recorded(job: Job) -> None:
     before = manifest(job)
     assert bring(job, "train", changes=longer(6000)) == ["train"]

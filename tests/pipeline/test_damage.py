@@ -41,6 +41,7 @@ def stop_in_mid_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fake_stages, "write_bytes", write_three)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("name", NAMES)
 def test_every_file_of_every_stage_that_was_damaged_is_made_anew(

@@ -22,6 +22,7 @@ def masks(job, monkeypatch):
     return job.workspace.folder("train") / "masks"
 
 
+@pytest.mark.integration
 def test_a_changed_a_removed_and_an_added_one_are_named_and_handed_on(job, masks):
     (masks / "0.png").write_text("by hand")
     (masks / "1.png").unlink()

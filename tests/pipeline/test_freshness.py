@@ -19,6 +19,7 @@ from recon_cli.workspace.summaries import IngestSummary
 AFTER = {name: NAMES[NAMES.index(name):] for name in NAMES}  # a stage and all behind it
 
 
+@pytest.mark.integration
 def test_a_finished_workspace_is_fresh_and_nothing_runs_twice(job: Job) -> None:
     assert stale(job) == {}
     assert bring(job, *NAMES) == []
@@ -114,6 +115,7 @@ def test_a_result_of_an_older_version_is_made_again_where_it_is_asked_for(job: J
     assert stale(newer) == {}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("by", [1, -1])
 @pytest.mark.parametrize("name", ["ingest", "denoise", "place", "train"])
 def test_a_scene_of_another_version_is_scored_and_exported_with_a_notice_but_not_trained(

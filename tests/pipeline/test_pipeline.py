@@ -235,6 +235,7 @@ def test_an_interrupted_run_is_partial_until_what_it_reads_changes(job: Job) -> 
     assert plan.status(job)[4].state == "missing"
 
 
+@pytest.mark.integration
 def test_killed_and_run_again_gives_what_an_uninterrupted_run_gives(job: Job) -> None:
     expected = written(job, "train")
     shutil.rmtree(job.workspace.folder("train"))

@@ -28,6 +28,7 @@ pytestmark = every_backend
 CLOSED_FORM_TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-13}
 
 
+@pytest.mark.integration
 def test_one_gaussian_at_a_known_pixel_has_its_closed_form_colour(case):
     camera = camera_at(64, 48)
     splats = one_splat((0.2, 0.1, 3.0), scale=0.1, opacity=0.6, color=(0.9, 0.5, 0.1))
@@ -84,6 +85,7 @@ def scene_for(case, *, seed):
     return random_splats(count, seed=seed), camera_at(*size)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_images_and_gradients_agree_with_the_brute_force(case, degree):
     splats, camera = scene_for(case, seed=degree)
@@ -95,6 +97,7 @@ def test_images_and_gradients_agree_with_the_brute_force(case, degree):
         assert error <= max(GRADIENT_TOLERANCE[case.dtype], loose), f"{name}: {error:.1e}"
 
 
+@pytest.mark.integration
 def test_the_gradient_of_the_background_is_what_is_left_of_it(case):
     background = GREENISH.clone().requires_grad_()
     splats, camera = scene_for(case, seed=5)
@@ -109,6 +112,7 @@ def test_the_gradient_of_the_background_is_what_is_left_of_it(case):
     assert torch.allclose(background.grad, expected.double(), rtol=0, atol=limit)
 
 
+@pytest.mark.integration
 def test_coefficients_that_are_not_in_use_get_no_gradient(case):
     tracked, camera = case.leaves(random_splats(12)), camera_at(20, 12)
     case.render(tracked, camera).rgb.sum().backward()
@@ -140,6 +144,7 @@ def test_gradcheck_passes_away_from_thresholds(case):
         image, values, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True)
 
 
+@pytest.mark.integration
 def test_long_lists_are_carried_across_blocks(case):
     # blocks end at every 64th of all instances; an interpreter's lists of 100 and 93 reach over 5
     count = 300 if case.interpreted else 500
@@ -151,6 +156,7 @@ def test_long_lists_are_carried_across_blocks(case):
     assert found.doubtful <= 4
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("size", [(1, 1), (15, 17), (16, 16), (33, 1)])
 def test_any_image_size_and_principal_point_work(case, size):
     camera = camera_at(*size, focal=20.0)

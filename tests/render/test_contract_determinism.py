@@ -52,6 +52,7 @@ def test_the_same_input_gives_the_same_bits(case):
         assert torch.equal(value, second[name]), name
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("case", at_size([c for c in CASES if c.device == "cpu"]), ids=str)
 def test_the_number_of_threads_changes_nothing(case, threads):
     splats, camera = scene_for(case)

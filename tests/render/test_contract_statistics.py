@@ -77,6 +77,7 @@ def test_hits_and_blend_weights_match_their_definition(case):
     assert statistics.blend_max[(expected == 0).to(case.device)].abs().sum() == 0
 
 
+@pytest.mark.integration
 def test_scores_are_zero_unless_they_are_asked_for(case):
     splats, camera = scene(seed=6)
     out = case.render(case.leaves(splats), camera)
@@ -88,6 +89,7 @@ def test_scores_are_zero_unless_they_are_asked_for(case):
     assert out.statistics.means2d_grad.abs().max() > 0
 
 
+@pytest.mark.integration
 def test_gradients_of_pixels_add_up_to_their_definitions(case):
     splats, camera = scene(seed=6)
     nudges = Nudges.zeros(len(splats), camera)
@@ -119,6 +121,7 @@ def test_clamped_fragments_count_in_the_variance_and_add_nothing_to_it(case):
     assert close(out.statistics.variance, variance, SQUARE_TOLERANCE[case.dtype])
 
 
+@pytest.mark.integration
 def test_leave_one_out_is_the_squared_change_of_removing_that_gaussian(case):
     splats, camera = scene(seed=6)
     out = case.render(case.leaves(splats), camera, GREENISH, 2, scores=True)
@@ -127,6 +130,7 @@ def test_leave_one_out_is_the_squared_change_of_removing_that_gaussian(case):
     assert close(out.statistics.loo, expected, SQUARE_TOLERANCE[case.dtype])
 
 
+@pytest.mark.integration
 def test_pixels_that_a_mask_ignores_count_in_no_score(case):
     splats, camera = scene(seed=6)
     mask = torch.rand(20, 33, generator=torch.Generator().manual_seed(0)) < 0.5
@@ -141,6 +145,7 @@ def test_pixels_that_a_mask_ignores_count_in_no_score(case):
     assert close(found.loo, expected, SQUARE_TOLERANCE[case.dtype])
 
 
+@pytest.mark.integration
 def test_a_mask_of_the_scores_changes_neither_picture_nor_gradient(case):
     splats, camera = scene(seed=6)
     pictures = []

@@ -58,6 +58,7 @@ def test_opacities_of_one_are_clamped_and_have_no_gradient_where_they_are(case):
     assert (tracked.sh_dc.grad != 0).all()
 
 
+@pytest.mark.integration
 @every_backend
 def test_a_saturated_opacity_keeps_its_gradient_where_alpha_is_not_clamped(case):
     splats = one_splat((0.0, 0.0, 2.0), scale=0.3, opacity=0.5, color=(0.9, 0.5, 0.1))
@@ -138,6 +139,7 @@ def test_a_hundred_coincident_gaussians_agree_with_the_oracle(case):
     assert found.gradient <= GRADIENT_TOLERANCE[case.dtype]
 
 
+@pytest.mark.integration
 @every_backend
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_thresholds_drop_no_more_than_the_theory_says(case, seed):

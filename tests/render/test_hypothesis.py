@@ -155,6 +155,7 @@ def tries(count):
                     suppress_health_check=list(HealthCheck))
 
 
+@pytest.mark.integration
 @every_compiled_backend
 @tries(120)
 @given(scene=scenes())
@@ -170,6 +171,7 @@ def test_any_small_scene_is_finite_and_agrees_with_float64_in_an_interpreter(cas
     check(case, *scene)
 
 
+@pytest.mark.integration
 @every_compiled_backend
 @tries(120)
 @given(scene=scenes(), seed=st.integers(0, 100))

@@ -209,6 +209,7 @@ def flip(at):
     return change
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("damage", [
     flip(0), flip(40), flip(-1), flip(-2000), lambda path, _: path.write_bytes(b""),
     lambda path, _: os.truncate(path, 20), lambda path, _: os.truncate(path, 500),

@@ -4,6 +4,7 @@ import gc
 import weakref
 
 import numpy as np
+import pytest
 import torch
 from scenes import camera_at, leaves, random_splats
 
@@ -18,6 +19,7 @@ BLACK = torch.zeros(3)
 MOST_BUFFERS = 60e6  # bytes, for 100,000 Gaussians at 640x360
 
 
+@pytest.mark.integration
 def test_the_buffers_of_a_step_stay_small():
     splats, camera = room(100_000, 640, 360)
     step = PhotometricStep()

@@ -157,6 +157,7 @@ def check(ratios: dict[str, float]) -> None:
     assert not {name: ratio for name, ratio in ratios.items() if not ratio < 1}
 
 
+@pytest.mark.integration
 @every_case
 @pytest.mark.parametrize("fault", [*NAMES, "means2d"])
 def test_a_gradient_that_is_one_percent_too_long_is_noticed(case: Case, fault: str) -> None:
@@ -164,6 +165,7 @@ def test_a_gradient_that_is_one_percent_too_long_is_noticed(case: Case, fault: s
     assert {name for name, ratio in ratios.items() if ratio > 1} == {f"grad {fault}"}
 
 
+@pytest.mark.integration
 @every_case
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("render_mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
@@ -184,6 +186,7 @@ def test_harmonics(case: Case, degree: int) -> None:
     check(compare(case, scene(20, degree=degree), sh_degree=degree))
 
 
+@pytest.mark.integration
 @every_case
 def test_colours_and_harmonics_of_each_camera(case: Case) -> None:
     inputs = scene(20)
@@ -209,6 +212,7 @@ def test_the_near_plane_is_nearer_than_that_of_training() -> None:
     assert shown == [{0, 1}, set()]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("case", [c for c in CASES if c.backend == "torch"], ids=str)
 def test_the_torch_backend_takes_any_low_pass_filter(case: Case) -> None:
     for eps2d in (0.05, 1.5):
@@ -231,6 +235,7 @@ def call(**changes):
     return rasterization(**(inputs | changes))
 
 
+@pytest.mark.integration
 def test_tiny_and_negative_scales_keep_their_gradients() -> None:
     inputs = scene()
     inputs["scales"][5:9] = torch.tensor([1e-6, -0.2, 1e-12, 0.1])[:, None]
@@ -244,6 +249,7 @@ def test_tiny_and_negative_scales_keep_their_gradients() -> None:
     assert not flat.grad[:, 2].any()  # a covariance is even in each scale
 
 
+@pytest.mark.integration
 def test_the_gradient_of_an_opacity_of_one_is_that_of_one_just_below() -> None:
     gradients = []
     for value in (1.0, 1 - 1e-6):

@@ -77,6 +77,7 @@ def test_the_gradients_are_slopes():
         assert slope == pytest.approx((ends[0] - ends[1]) / (2 * reach), rel=1e-4, abs=1e-4)
 
 
+@pytest.mark.integration
 def test_a_lens_has_its_vignette_at_any_size_and_no_other_lens_has_it():
     falloffs = LensFalloffs({lens(camera_at(640, 480, focal=500.0)): (-0.4, 0.0)})
     half, other = camera_at(320, 240, focal=250.0), camera_at(320, 240, focal=400.0)

@@ -27,6 +27,7 @@ PASSED = Verdict("triton", "a GPU", "", {"rgb, hard scene": 0.01}, 1.0)
 
 # ---- the check itself ----
 
+@pytest.mark.integration
 def test_the_numba_kernels_pass_far_from_what_is_allowed():
     verdict = check(numba_candidate(), CPU)
     assert verdict.passed, verdict.failure
@@ -119,6 +120,7 @@ def no_number(result):
     return dataclasses.replace(result, loss=float("nan"))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("candidate", "failure"), [
     (faulty(brighter), "rgb, ordinary scene"),
     (faulty(one_wrong_pixel), "depth, ordinary scene"),

@@ -35,6 +35,7 @@ def pictures(splats, case):
     return [out.rgb, out.depth, tracked.means.grad, tracked.sh_rest.grad, out.statistics.loo]
 
 
+@pytest.mark.integration
 def test_the_same_small_scene_gives_the_same_bits_in_any_order_of_its_gaussians():
     case, splats = Case("triton", DEVICE, torch.float32), random_splats(24, seed=2)
     first, again = pictures(splats, case), pictures(splats, case)

@@ -31,6 +31,7 @@ def files(workspace):
             if path.is_file() and path.name != "report.html"}
 
 
+@pytest.mark.integration
 def test_the_page_is_one_file_and_nothing_else_changes(workspace, capsys):
     before = files(workspace)
     assert report(workspace) == 0
@@ -41,6 +42,7 @@ def test_the_page_is_one_file_and_nothing_else_changes(workspace, capsys):
     assert states == {"fresh"}
 
 
+@pytest.mark.integration
 def test_the_page_shows_what_the_stages_say(workspace):
     page = page_of(workspace)
     metrics = json.loads((workspace / "evaluate" / "metrics.json").read_text())
@@ -61,6 +63,7 @@ def test_the_page_shows_what_the_stages_say(workspace):
         assert lacking not in page
 
 
+@pytest.mark.integration
 def test_every_option_of_every_stage_is_there_with_what_was_decided(workspace):
     settings = section(page_of(workspace), "settings")
     for row in TABLE:
@@ -111,6 +114,7 @@ def test_what_is_missing_is_said_in_its_place_with_the_command(workspace):
     assert STALE not in page
 
 
+@pytest.mark.integration
 def test_no_section_shows_figures_of_a_stale_stage_without_saying_so(workspace):
     (workspace / "recon.toml").write_text("[train]\niterations = 7\n")
     page = page_of(workspace)
@@ -144,6 +148,7 @@ def test_scores_that_were_changed_by_hand_are_stale_and_may_hold_anything(worksp
         assert "The scores are not shown: " in section(page, "views")
 
 
+@pytest.mark.integration
 def test_a_log_that_cannot_be_read_is_said_in_its_place(workspace):
     (workspace / "train" / "log.jsonl").write_text('{"iteration": "many"}\n')
     training = section(page_of(workspace), "training")
@@ -151,6 +156,7 @@ def test_a_log_that_cannot_be_read_is_said_in_its_place(workspace):
     assert "after pruning" in training
 
 
+@pytest.mark.integration
 def test_a_log_that_was_changed_or_is_gone_is_said_in_its_place(workspace):
     log = workspace / "train" / "log.jsonl"
     log.write_text("".join(log.read_text().splitlines(True)[:-1]))
@@ -160,6 +166,7 @@ def test_a_log_that_was_changed_or_is_gone_is_said_in_its_place(workspace):
     assert "The log of train is not shown: log.jsonl cannot be read" in training
 
 
+@pytest.mark.integration
 def test_pictures_that_are_gone_are_said_and_the_others_are_shown(workspace):
     (workspace / "evaluate" / "truth" / "000004.png").unlink()
     (workspace / "evaluate" / "renders" / "base" / "000008.png").write_bytes(b"no picture")
@@ -171,6 +178,7 @@ def test_pictures_that_are_gone_are_said_and_the_others_are_shown(workspace):
     assert "No picture can be shown" in section(page_of(workspace), "views")
 
 
+@pytest.mark.integration
 def test_a_damaged_manifest_is_said_and_a_damaged_first_one_is_7(workspace, capsys):
     (workspace / "train" / "manifest.json").write_text("{")
     page = page_of(workspace)
@@ -182,6 +190,7 @@ def test_a_damaged_manifest_is_said_and_a_damaged_first_one_is_7(workspace, caps
     assert "`recon clean ingest" in capsys.readouterr().err
 
 
+@pytest.mark.integration
 def test_an_unfinished_run_is_said(workspace):
     place = Workspace(workspace)
     key = Manifest.read(workspace / "train").key
@@ -193,6 +202,7 @@ def test_an_unfinished_run_is_said(workspace):
     assert "recon train --iterations 60" in training
 
 
+@pytest.mark.integration
 def test_a_damaged_model_leaves_out_the_plan_alone(workspace):
     (workspace / "place" / "undistorted" / "sparse" / "images.bin").write_bytes(b"short")
     capture = section(page_of(workspace), "capture")
@@ -201,6 +211,7 @@ def test_a_damaged_model_leaves_out_the_plan_alone(workspace):
     assert "<figcaption>000000.png</figcaption>" in capture  # thumbnails, without a sheet
 
 
+@pytest.mark.integration
 def test_contact_sheets_take_the_place_of_thumbnails_and_many_are_counted(workspace):
     for number in range(6):
         write_png(workspace / "ingest" / f"{number:02d}_contact.png",
@@ -211,6 +222,7 @@ def test_contact_sheets_take_the_place_of_thumbnails_and_many_are_counted(worksp
     assert "Some of the frames" not in capture
 
 
+@pytest.mark.integration
 def test_what_is_fixed_to_the_camera_is_shown(workspace):
     assert "fixed to the camera" not in section(page_of(workspace), "capture")
     write_png(workspace / "ingest" / "overlay.png", np.full((30, 40, 3), 9, np.uint8))
@@ -233,6 +245,7 @@ def test_frames_without_a_camera_are_lost_in_the_legend(workspace):
     assert "000099.png (lost" in capture
 
 
+@pytest.mark.integration
 def test_a_part_that_was_left_out_is_said_with_its_place_in_the_video(workspace):
     added = [f"00009{i}.png" for i in range(4)]
 
@@ -281,6 +294,7 @@ def test_a_page_among_the_inputs_would_be_one_of_them(workspace, tmp_path, capsy
     assert list((tmp_path / "photos").iterdir()) == []
 
 
+@pytest.mark.integration
 def test_a_file_name_that_is_no_utf8_is_shown_as_it_can_be(workspace):
     manifest = Manifest.read(workspace / "ingest")
     source = dataclasses.replace(manifest.key.sources[0], path="/gone/b\udcff.mp4")
@@ -300,12 +314,14 @@ def test_what_is_no_page_is_refused_and_left_as_it_was(workspace, tmp_path, name
     assert (tmp_path / "room.mp4").read_text() == "a video"
 
 
+@pytest.mark.integration
 def test_a_page_goes_where_it_is_told(workspace, tmp_path):
     assert report(workspace, "-o", tmp_path / "new" / "room.HTML") == 0
     assert (tmp_path / "new" / "room.HTML").stat().st_size > 10_000
     assert not (workspace / "report.html").exists()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("number", "said"), [
     (errno.ENOSPC, "The disk is full"), (errno.EACCES, "not writable"),
     (errno.EIO, "cannot be written")])

@@ -79,6 +79,7 @@ def noisy(tmp_path):
     return tmp_path
 
 
+@pytest.mark.integration
 def test_pictures_keep_their_size_where_there_is_room(noisy):
     gallery = build_gallery(noisy, read_metrics(noisy), 50_000_000)
     assert (gallery.encoding, gallery.scaled, gallery.left_out) == (ENCODINGS[0], False, 0)
@@ -108,6 +109,7 @@ def test_at_the_last_resort_the_worst_views_stay_and_the_rest_is_counted(noisy):
     assert sum(view.size for view in gallery.views) <= 250_000
 
 
+@pytest.mark.integration
 def test_a_view_larger_than_a_screen_is_scaled_down(tmp_path):
     for folder in ("truth", "renders/base"):
         (tmp_path / folder).mkdir(parents=True)
@@ -122,6 +124,7 @@ def test_a_view_larger_than_a_screen_is_scaled_down(tmp_path):
     assert gallery.full == (1920, 1080)
 
 
+@pytest.mark.integration
 def test_what_evaluate_did_not_score_is_gray_in_the_difference(noisy):
     (noisy / "difference" / "base").mkdir(parents=True)
     difference = np.full((220, 300, 3), 40, np.uint8)

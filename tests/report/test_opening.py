@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from urllib.parse import unquote
 
+import pytest
 from report_workspace import give_title, page_of, report, section
 
 
@@ -28,11 +29,13 @@ def test_it_opens_with_a_render_the_word_and_the_name_of_the_capture(workspace):
     assert "of the surface well seen" in top(page)
 
 
+@pytest.mark.integration
 def test_a_title_that_was_given_to_the_export_is_that_of_the_report(workspace):
     give_title(workspace, "Anna's kitchen")
     assert "<h1>Anna&#39;s kitchen</h1>" in page_of(workspace)
 
 
+@pytest.mark.integration
 def test_files_are_links_from_wherever_the_page_lies(workspace, tmp_path):
     files = {name: workspace / "export" / name for name in ("splats.ply", "splats.spz")}
     page = page_of(workspace)
@@ -44,6 +47,7 @@ def test_files_are_links_from_wherever_the_page_lies(workspace, tmp_path):
     assert links(out.read_text(encoding="utf-8"), out.parent) == files
 
 
+@pytest.mark.integration
 def test_a_file_that_is_gone_is_no_link(workspace):
     Path(workspace / "export" / "splats.spz").unlink()
     page = page_of(workspace)
@@ -51,6 +55,7 @@ def test_a_file_that_is_gone_is_no_link(workspace):
     assert "splats.spz (gone)" in section(page, "exports")
 
 
+@pytest.mark.integration
 def test_without_renders_a_frame_of_the_capture_is_shown(workspace):
     shutil.rmtree(workspace / "evaluate")
     page = page_of(workspace)

@@ -93,6 +93,7 @@ def in_parts(finished, tmp_path, monkeypatch):
     return tmp_path / "ws"
 
 
+@pytest.mark.integration
 def test_the_page_shows_each_part_and_the_moment_between_them(in_parts):
     page = page_of(in_parts)
     capture = section(page, "capture")
@@ -107,6 +108,7 @@ def test_the_page_shows_each_part_and_the_moment_between_them(in_parts):
     assert_facts(page, "2 parts", "part 2", "can be trusted")
 
 
+@pytest.mark.integration
 def test_a_part_that_cannot_be_read_is_told_and_the_rest_shown(in_parts):
     (in_parts / "sfm" / "parts" / "1" / "images.bin").write_bytes(b"damaged")
     capture = section(page_of(in_parts), "capture")
@@ -114,5 +116,6 @@ def test_a_part_that_cannot_be_read_is_told_and_the_rest_shown(in_parts):
     assert '<div class="moment">' in capture
 
 
+@pytest.mark.integration
 def test_a_capture_in_one_part_has_no_such_section(workspace):
     assert "What to film to join" not in page_of(workspace)

@@ -4,6 +4,7 @@ import json
 import re
 
 import numpy as np
+import pytest
 from report_workspace import page_of, section
 
 from recon_cli.io.colmap import read_scene
@@ -22,6 +23,7 @@ def change(workspace, **fields):
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
 
+@pytest.mark.integration
 def test_shares_reliability_and_heat_maps_are_shown(workspace):
     shown = section(page_of(workspace), "trust")
     assert "of the surface that the views show is well seen" in shown
@@ -31,6 +33,7 @@ def test_shares_reliability_and_heat_maps_are_shown(workspace):
     assert "Nowhere is a large region" in shown
 
 
+@pytest.mark.integration
 def test_poorly_seen_regions_are_listed_escaped_and_drawn_in_the_plan(workspace):
     change(workspace, poorly_seen=[REGION.to_json()])
     page = page_of(workspace)
@@ -43,6 +46,7 @@ def test_poorly_seen_regions_are_listed_escaped_and_drawn_in_the_plan(workspace)
     assert "1 m across" in section(page_of(workspace), "trust")
 
 
+@pytest.mark.integration
 def test_a_reason_stands_in_place_of_trust(workspace):
     change(workspace, reason="The scene was imported without views.", models=[])
     shown = section(page_of(workspace), "trust")
@@ -50,6 +54,7 @@ def test_a_reason_stands_in_place_of_trust(workspace):
     assert "AUSE" not in shown
 
 
+@pytest.mark.integration
 def test_damaged_or_missing_files_are_said(workspace):
     (workspace / "evaluate" / "trust" / RECORD).write_text("{")
     assert "Trust is not shown" in section(page_of(workspace), "trust")

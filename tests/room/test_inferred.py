@@ -200,6 +200,7 @@ def test_a_mesh_closes_holes_only_if_it_is_asked_to():
     assert np.array_equal(again.mesh.vertices, result.mesh.vertices)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("most", [20, 200])
 def test_what_is_inferred_counts_among_the_triangles_that_are_allowed(most):
     whole, result = (mesh_of(

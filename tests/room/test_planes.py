@@ -29,6 +29,7 @@ def room(rng: np.random.Generator, noise: float) -> tuple[np.ndarray, np.ndarray
     return np.concatenate(points), np.concatenate(normals), np.concatenate(areas)
 
 
+@pytest.mark.integration
 def test_the_sides_of_a_room_are_found_to_a_fraction_of_their_noise():
     points, normals, areas = room(np.random.default_rng(1), 0.02)
     planes = find_planes(points, normals, areas, BAND)
@@ -51,6 +52,7 @@ def test_a_cloud_without_planes_has_none():
     assert find_planes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), BAND) == []
 
 
+@pytest.mark.integration
 def test_points_move_a_blurred_wall_to_where_it_is():
     rng = np.random.default_rng(3)
     points, normals, areas = room(rng, 0.01)
@@ -64,6 +66,7 @@ def test_points_move_a_blurred_wall_to_where_it_is():
     assert confirmed[wall].offset == pytest.approx(-5.0, abs=0.004)
 
 
+@pytest.mark.integration
 def test_without_points_nothing_is_confirmed():
     points, normals, areas = room(np.random.default_rng(5), 0.01)
     planes = find_planes(points, normals, areas, BAND)

@@ -47,6 +47,7 @@ def test_a_view_with_a_sensor_gets_a_map_with_less_than_its_noise():
     assert np.median(error) < NOISE / 3  # of the mean of 25
 
 
+@pytest.mark.integration
 def test_what_others_say_differently_counts_nothing_where_the_sensor_knows():
     maps = with_sensor(maps_of(off=1.2, seen=(0,), share=0.5))
     assert not maps.gains[0][:, :WIDTH // 2 - 2].any()

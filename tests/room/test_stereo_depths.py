@@ -24,6 +24,7 @@ def maps_of(cameras, paint):
     return weigh(views_of(cameras, paint), cameras, depths, [np.ones_like(d) for d in depths])
 
 
+@pytest.mark.integration
 def test_what_was_cut_off_stays_off():
     maps = maps_of(AROUND, grain)
     box = np.array([-1.0, -0.3, -9.0]), np.array([4.0, 9.0, 9.0])
@@ -61,6 +62,7 @@ def test_level_planes_are_searched_where_up_is_known(monkeypatch, up, searches):
     assert np.median(error) < 0.0025
 
 
+@pytest.mark.integration
 def test_large_views_are_searched_at_600_pixels_and_compared_at_their_own(monkeypatch):
     monkeypatch.setattr(stereo, "_SIDE", 80)
     maps = maps_of(AROUND, grain)
@@ -72,6 +74,7 @@ def test_large_views_are_searched_at_600_pixels_and_compared_at_their_own(monkey
     assert (found.gains[0] > 0).mean() < 0.3 < (found.gains[1] > 0).mean()
 
 
+@pytest.mark.integration
 def test_of_many_views_some_get_a_map(monkeypatch):
     monkeypatch.setattr(stereo, "_MOST_VIEWS", 5)
     maps = maps_of(AROUND, grain)

@@ -73,6 +73,7 @@ def error(mesh: Mesh, view: Camera) -> float:
     return float(np.abs(image - photo(view))[shown].mean())
 
 
+@pytest.mark.integration
 def test_a_texture_shows_what_lies_between_the_corners_of_triangles():
     views = [TrainView(view, photo(view)) for view in CAMERAS]
     mesh = add_texture(wall(), views, SIZE, "png", NullProgress())
@@ -82,6 +83,7 @@ def test_a_texture_shows_what_lies_between_the_corners_of_triangles():
     assert flat > 30  # which colours of so few corners would leave
 
 
+@pytest.mark.integration
 def test_photos_of_other_exposure_leave_no_seam():
     gains = np.where(np.arange(len(CAMERAS)) % 2, 0.8, 1.25)
     views = [TrainView(view, photo(view, gain)) for view, gain in zip(CAMERAS, gains, strict=True)]

@@ -29,6 +29,7 @@ def test_images_come_back_after_they_were_let_out_of_memory(tmp_path, monkeypatc
     assert not list(tmp_path.iterdir())  # nothing is left behind, whatever happens
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(sys.platform == "win32", reason="lets pages out of memory by itself")
 def test_no_more_than_the_window_stays_in_memory(tmp_path):
     process, size = psutil.Process(), 4 << 20

@@ -113,6 +113,7 @@ def test_learned_matches_of_which_few_agree_are_no_bridge():
     assert find(pair.photo(0, (0, 0, 0)), pair.photo(12, (1, 0.1, 0.2), moved)) is None
 
 
+@pytest.mark.integration
 def test_sift_is_matched_as_colmap_does(tmp_path):
     job, _ = make_capture(tmp_path, frames=3, points=50)
     generator = np.random.default_rng(0)
@@ -202,6 +203,7 @@ def build(job):
                     if isinstance(event := parse(line), str)]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("bridges")
 def test_what_sift_cannot_place_is_bridged_in_a_database_of_its_own(without_some):
     job, truth = without_some
@@ -214,6 +216,7 @@ def test_what_sift_cannot_place_is_bridged_in_a_database_of_its_own(without_some
     assert center_error(pycolmap.Reconstruction(job.model), truth) < 1e-2
 
 
+@pytest.mark.integration
 def test_without_weights_the_command_is_named_and_all_is_as_before(without_some, monkeypatch):
     job, _ = without_some
     monkeypatch.setattr(xfeat_weights, "are_installed", lambda: False)
@@ -224,6 +227,7 @@ def test_without_weights_the_command_is_named_and_all_is_as_before(without_some,
     assert_facts(named[0], xfeat_weights.COMMAND, "recon sfm --again")
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("bridges")
 def test_damaged_weights_are_told_and_not_used(without_some, monkeypatch):
     job, _ = without_some
@@ -234,6 +238,7 @@ def test_damaged_weights_are_told_and_not_used(without_some, monkeypatch):
     assert sum(xfeat_weights.COMMAND in text for text in told) == 1
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("bridges")
 def test_a_bridge_that_makes_nothing_better_leaves_the_old_model(without_some, monkeypatch):
     job, _ = without_some
@@ -243,6 +248,7 @@ def test_a_bridge_that_makes_nothing_better_leaves_the_old_model(without_some, m
         ("exhaustive", True), ("bridge", False)]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("bridges")
 def test_bridges_that_place_too_few_are_mapped_again_with_lower_thresholds(
     without_some, monkeypatch
@@ -321,6 +327,7 @@ def test_bridges_that_give_no_trusted_model_replace_nothing():
     assert fallbacks.best_attempt([few, replace(bridged, trusted=True)]).registered == names
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("bridges")
 def test_a_killed_bridge_gives_the_same_model_when_it_is_run_again(
     without_some, monkeypatch, tmp_path

@@ -68,6 +68,7 @@ def off_after_similarity(found, true):
     return np.trace(np.diag(s) @ flip) / (a**2).sum() * a @ (u @ flip @ vt).T - b
 
 
+@pytest.mark.integration
 def test_errors_are_the_spread_of_adjustments_to_noisy_pixels():
     made = converging()
     true = np.array([pose.inverse().translation for pose in made.poses])

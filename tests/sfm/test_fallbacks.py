@@ -204,6 +204,7 @@ def test_where_no_mapper_found_a_model_none_is_best():
     assert best_attempt([MapperAttempt("exhaustive", ""), MapperAttempt("relaxed", "")]) is None
 
 
+@pytest.mark.integration
 def test_a_good_capture_stops_at_the_first_attempt(tmp_path):
     job, truth = make_capture(tmp_path)  # with points enough to try other lenses on
     result = build(job)
@@ -225,6 +226,7 @@ def nothing(*_, **__):
     return []
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("few_pairs")
 def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     job, _ = capture
@@ -236,6 +238,7 @@ def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     assert [item.reason for item in result.attempts[1:]] == ["no model was found"] * 2
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("few_pairs")
 def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
     job, _ = capture
@@ -249,6 +252,7 @@ def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
     assert_facts(told[0], "another mapper", "minutes more", "no model was found")
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("few_pairs")
 def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypatch):
     job, truth = capture
@@ -262,6 +266,7 @@ def test_models_beside_the_best_are_kept_until_their_parts_are(capture, monkeypa
     assert sorted(path.name for path in job.parts.iterdir()) == ["1", "2"]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("few_pairs")
 def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     job, _ = capture
@@ -274,6 +279,7 @@ def test_no_model_at_all_is_a_failure_that_counts_frames(capture, monkeypatch):
     assert not (job.model).exists()
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("few_pairs")
 @pytest.mark.parametrize(("minutes", "skipped"), [(0.0, True), (1.0, False)])
 def test_a_mapper_is_skipped_by_the_work_that_is_left_and_by_no_clock(
@@ -296,6 +302,7 @@ def test_the_work_of_a_further_mapper_grows_with_pairs_frames_and_attempts(captu
     assert len(set(seconds)) == 4
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("few_pairs")
 @pytest.mark.parametrize(("least", "tried"), [(0.5, [True, False, False]), (1.1, [True] * 3)])
 def test_late_mappers_improve_no_model_that_is_enough_but_replace_one_that_is_not(
@@ -323,6 +330,7 @@ def test_a_job_has_less_time_left_after_some_of_it(capture):
     assert replace(job, spare_minutes=None).after(5.0).spare_minutes is None
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("few_pairs")
 def test_an_interrupted_build_goes_on_after_the_last_finished_attempt(capture, monkeypatch):
     job, _ = capture

@@ -83,6 +83,7 @@ def test_a_blob_is_found_where_it_is_and_as_large_as_it_is(tmp_path, monkeypatch
         assert database.scales(found[[off.argmin()]])[0] == pytest.approx(6.0, rel=0.15)
 
 
+@pytest.mark.integration
 def test_features_are_those_that_colmap_finds(job):
     extract_features(job, SILENT)
     theirs = make_job(job.out / "colmap", textures())
@@ -103,6 +104,7 @@ def test_features_are_those_that_colmap_finds(job):
             np.linalg.norm(rows, axis=1).mean(), rel=0.02)
 
 
+@pytest.mark.integration
 def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
     extract_features(job, SILENT)
     few = make_job(job.out / "few", textures(), max_features=100)
@@ -119,6 +121,7 @@ def test_an_image_keeps_its_coarsest_keypoints_and_no_more_than_asked_for(job):
         assert np.abs(off).mean() < 1
 
 
+@pytest.mark.integration
 def test_a_large_image_is_reduced_where_that_leaves_enough(tmp_path, monkeypatch):
     monkeypatch.setattr(features.checks, "check_texture", lambda _: None)
     spots = np.zeros((1080, 1800), np.float32)
@@ -181,6 +184,7 @@ def test_frames_without_texture_are_refused(tmp_path):
         extract_features(flat, SILENT)
 
 
+@pytest.mark.integration
 def test_an_extraction_that_goes_on_gives_the_same(job):
     one = replace(job.groups[0], names=NAMES[:1])
     two = replace(job.groups[0], names=NAMES[1:])

@@ -114,6 +114,7 @@ def wide(tmp_path_factory):
     return job.out / "undistorted", job, model, told
 
 
+@pytest.mark.integration
 def test_each_pixel_of_a_view_shows_its_direction(wide):
     out, job, _, told = wide
     scene = read_scene(out, held_out=frozenset(), validation=0.0)
@@ -128,6 +129,7 @@ def test_each_pixel_of_a_view_shows_its_direction(wide):
     assert [text for text in told if "4 pinhole views" in text]
 
 
+@pytest.mark.integration
 def test_points_lie_where_the_views_see_them(wide):
     out, _, model, _ = wide
     flat = pycolmap.Reconstruction(out / "sparse")

@@ -28,6 +28,7 @@ def hall(*, floor: bool) -> MadeModel:
     return MadeModel(np.concatenate([points, ground[:3000 * floor]]), along(np.arange(30) * 0.4))
 
 
+@pytest.mark.integration
 def test_the_height_is_that_over_the_floor_and_unknown_without_one():
     made = hall(floor=True)
     heights = measure_heights(made.model(), made.names)
@@ -95,6 +96,7 @@ def flat(tilt_deg=0.3, *, shrink=1.0):
     return model, [f"{index}.png" for index in range(1, 7)]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("shrink", [1.0, 0.9])
 def test_level_panoramas_know_their_heights_under_the_ceiling_too(shrink):
     heights = measure_heights(*flat(shrink=shrink))

@@ -66,6 +66,7 @@ def test_an_ordinary_lens_is_none_but_what_it_says():
     assert find_better_lenses(model_of(WIDE), [1]) == ()
 
 
+@pytest.mark.integration
 def test_a_fisheye_that_was_mapped_as_an_ordinary_lens_is_found_out():
     (found,) = find_better_lenses(forced(model_of(FISHEYE), "OPENCV"), [1])
     assert (found.camera, found.model, found.better) == (1, "OPENCV", "OPENCV_FISHEYE")
@@ -75,12 +76,14 @@ def test_a_fisheye_that_was_mapped_as_an_ordinary_lens_is_found_out():
     assert "--camera-model OPENCV_FISHEYE" in found.sentence()
 
 
+@pytest.mark.integration
 def test_pixels_that_are_not_square_are_found_by_their_second_focal_length():
     (found,) = find_better_lenses(forced(model_of(STRETCHED), "SIMPLE_RADIAL"), [1])
     assert found.better in ("OPENCV", "OPENCV_FISHEYE")
     assert found.is_wrong
 
 
+@pytest.mark.integration
 def test_cameras_that_are_known_and_few_points_are_not_judged():
     wrong = forced(model_of(FISHEYE), "OPENCV")
     assert find_better_lenses(wrong, []) == ()

@@ -54,10 +54,12 @@ def matches_of(made, folder):
     return matching.read_verified(made.write_database(folder / "database.db"))
 
 
+@pytest.mark.integration
 def test_a_model_that_is_right_is_left_as_it_is(made, tmp_path):
     assert optimize_model(made.model(), matches_of(made, tmp_path), seed=0) is None
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("scale", "degrees"), [(1.37, 0), (0.75, 0), (1.1, 6)])
 def test_a_loop_takes_a_break_of_scale_back(made, tmp_path, scale, degrees):
     turn = made.poses[TURN].inverse().translation
@@ -67,6 +69,7 @@ def test_a_loop_takes_a_break_of_scale_back(made, tmp_path, scale, degrees):
     assert errors(closed, made).max() < 0.1  # a tenth of the break, and more
 
 
+@pytest.mark.integration
 def test_what_only_looks_alike_closes_no_loop(made, tmp_path):
     model = broken(made, about(made.poses[TURN].inverse().translation, 1.0, 60))
     assert optimize_model(model, matches_of(made, tmp_path), seed=0) is None
@@ -89,6 +92,7 @@ def test_a_walk_is_weakest_where_no_point_is_seen_from_both_sides(made):
     assert np.median(known.scale) < 0.05
 
 
+@pytest.mark.integration
 def test_segments_meet_in_their_common_frames_and_close_their_loop(tmp_path):
     parts = [there_and_back(landmark=lambda _, point: point, unregistered=frozenset(missing))
              for missing in (range(28, 48), range(20))]

@@ -70,6 +70,7 @@ def test_known_intrinsics_stay_as_they_are(tmp_path):
     np.testing.assert_array_equal(model.camera(1).params, truth.camera(1).params)
 
 
+@pytest.mark.integration
 def test_the_global_mapper_finds_the_cameras_and_leaves_the_database_alone(tmp_path):
     job, truth = make_capture(tmp_path)
     before = job.database.read_bytes()

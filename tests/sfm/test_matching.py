@@ -196,6 +196,7 @@ def test_two_equal_descriptors_are_no_match_of_a_third():
     assert row not in match_descriptors(ours, np.concatenate([theirs, theirs[[column]]]))[:, 0]
 
 
+@pytest.mark.integration
 def test_the_matches_are_those_of_colmaps_brute_force(job):
     job = textured(job)
     for seed, name in enumerate(NAMES):  # the same texture, moved

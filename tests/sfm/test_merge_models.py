@@ -38,6 +38,7 @@ def test_the_similarity_between_two_parts_is_found_from_their_points(capture):
         found.matrix[:3], moved().inverse().matrix(), atol=1e-6)
 
 
+@pytest.mark.integration
 def test_a_join_counts_both_ways_only_where_three_images_of_each_agree_on_the_scale(
     capture, monkeypatch
 ):
@@ -93,6 +94,7 @@ def test_nothing_comes_of_no_model(fresh_capture):
     assert merge_models.best_model(job, []) is None
 
 
+@pytest.mark.integration
 def test_parts_that_fit_become_one_model_and_nothing_is_apart(fresh_capture):
     job, truth = fresh_capture
     found = merge_models.best_model(job, [
@@ -102,6 +104,7 @@ def test_parts_that_fit_become_one_model_and_nothing_is_apart(fresh_capture):
     assert center_error(found.model, truth) < 1e-3
 
 
+@pytest.mark.integration
 def test_parts_that_cannot_be_put_together_are_named(fresh_capture, monkeypatch):
     job, truth = fresh_capture
     monkeypatch.setattr(merge_models, "find_similarity", lambda *_: None)
@@ -112,6 +115,7 @@ def test_parts_that_cannot_be_put_together_are_named(fresh_capture, monkeypatch)
     assert found.apart == (job.names[14:],)  # 12 and 13 are fewer than three
 
 
+@pytest.mark.integration
 def test_a_merge_that_cannot_be_trusted_is_undone(fresh_capture, monkeypatch):
     job, truth = fresh_capture
     say(monkeypatch, lambda model: Opinion(trusted=model.num_reg_images() < 20))
@@ -120,6 +124,7 @@ def test_a_merge_that_cannot_be_trusted_is_undone(fresh_capture, monkeypatch):
     assert found.apart == (job.names[12:],)
 
 
+@pytest.mark.integration
 def test_a_camera_that_was_put_elsewhere_is_found_taken_out_and_named(fresh_capture):
     job, truth = fresh_capture
     wrong = job.names[7]

@@ -33,6 +33,7 @@ def job(tmp_path_factory):
     return job
 
 
+@pytest.mark.integration
 def test_a_turned_panorama_has_the_same_features_in_turned_places(job):
     (ours, descriptors), (theirs, others) = (find_on_faces(job, name) for name in (
         "a.png", "b.png"))
@@ -47,6 +48,7 @@ def test_a_turned_panorama_has_the_same_features_in_turned_places(job):
     assert np.median(np.abs(same).max(axis=1)) <= 2
 
 
+@pytest.mark.integration
 def test_features_lie_on_the_panorama_and_the_coarsest_are_kept(job):
     keypoints, _ = find_on_faces(job, "a.png")
     assert (keypoints[:, 0] >= 0).all()

@@ -39,6 +39,7 @@ def test_nothing_moves_where_nothing_pulls():
     assert measure_residuals(constraints, poses).max() < 1e-9
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 def test_a_break_of_scale_is_taken_back_at_the_weak_edge(factor):
     deviations = np.full(COUNT - 1, 0.002)

@@ -67,12 +67,14 @@ def weakest(made: MadeModel, *, model=None, ordered: bool = True, **options):
     return find_weakest_scale(model, evidence, order, **options)
 
 
+@pytest.mark.integration
 def test_what_both_halves_see_near_by_ties_their_scales():
     cut = weakest(halves(near(300)))
     assert cut.error < MAX_SCALE_ERROR
     assert is_scale_known(cut)
 
 
+@pytest.mark.integration
 def test_where_only_the_distance_is_seen_from_both_halves_their_scale_is_unknown():
     made = halves(far(60))
     cut = weakest(made)
@@ -82,12 +84,14 @@ def test_where_only_the_distance_is_seen_from_both_halves_their_scale_is_unknown
     assert sorted(cut.sides[0] + cut.sides[1]) == made.names
 
 
+@pytest.mark.integration
 def test_the_cut_is_searched_between_two_images_where_they_are_named():
     made = halves(far(60))
     cut = weakest(made, between=(made.names[6], made.names[11]))
     assert made.names[6] <= cut.before < cut.after <= made.names[11]
 
 
+@pytest.mark.integration
 def test_photos_without_an_order_are_cut_where_few_points_tie_them():
     made = halves(far(60), count=14)
     cut = weakest(made, ordered=False)
@@ -96,6 +100,7 @@ def test_photos_without_an_order_are_cut_where_few_points_tie_them():
     assert is_scale_known(weakest(halves(near(300), count=14), ordered=False))
 
 
+@pytest.mark.integration
 def test_photos_given_twice_have_no_scale_of_their_own():
     twice = np.repeat(np.arange(8) * 0.5, 2) + np.tile([0, 1e-14], 8)
     made = NoisyModel(wall(-3, 6, count=600), along(twice))
@@ -116,6 +121,7 @@ def test_pixels_that_a_bent_lens_has_no_direction_for_say_nothing():
     assert np.isfinite(weakest(made, model=model, ordered=False).error)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("ordered", [False, True])
 def test_a_side_that_collapsed_is_measured_by_itself(ordered):
     """One half shrinks with all that it alone sees; the distance is as it was."""
@@ -147,6 +153,7 @@ def test_a_scale_that_nothing_contradicts_is_an_interval_and_no_reason_to_cut(er
     assert not is_scale_known(replace(cut, error=0.16))
 
 
+@pytest.mark.integration
 def test_the_matches_across_contradict_a_half_of_another_scale():
     made = halves(far(60))
     right = weakest(made)
@@ -157,6 +164,7 @@ def test_the_matches_across_contradict_a_half_of_another_scale():
     assert weakest(made, model=model).explained < MIN_SURE_EXPLAINED <= right.explained
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("drift", [0.02, 0.05, 0.10])
 def test_a_drift_that_observations_leave_is_inside_the_interval(drift):
     """Points are seen from five cameras in a row: nothing else ties the ends of the walk."""
@@ -189,6 +197,7 @@ def test_a_drift_that_observations_leave_is_inside_the_interval(drift):
     assert cut.drift > cut.error, "the errors along the walk add up"
 
 
+@pytest.mark.integration
 def test_a_camera_that_stands_still_moves_too_little_for_its_scale_to_matter():
     cut = weakest(NoisyModel(wall(-3, 3, count=300), along(np.arange(24) * 0.01)))
     assert is_scale_known(cut)

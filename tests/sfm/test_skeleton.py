@@ -150,6 +150,7 @@ def test_known_pairs_that_overlap_take_the_place_of_others():
     assert not two_each & one_each
 
 
+@pytest.mark.integration
 def test_known_pairs_that_cannot_see_the_same_take_no_place():
     model = walk(30).model()
     images = sorted((model.image(number) for number in model.reg_image_ids()),
@@ -211,6 +212,7 @@ def test_pairs_that_were_matched_in_vain_are_remembered(tmp_path):
     assert evidence.tried[0, 4]
 
 
+@pytest.mark.integration
 def test_pairs_that_look_alike_contradict_the_cameras(tmp_path):
     made = walk()
     job = make_job(tmp_path, made)
@@ -226,6 +228,7 @@ def test_pairs_that_look_alike_contradict_the_cameras(tmp_path):
     assert set(geometries) - across <= checked.agreeing
 
 
+@pytest.mark.integration
 def test_pairs_that_a_drift_explains_are_kept_apart(tmp_path):
     made = walk()
     job = make_job(tmp_path, made)
@@ -237,6 +240,7 @@ def test_pairs_that_a_drift_explains_are_kept_apart(tmp_path):
     assert checked.drifted <= across
 
 
+@pytest.mark.integration
 def test_a_single_pair_closes_no_loop(tmp_path):
     made = walk()
     job = make_job(tmp_path, made)
@@ -277,6 +281,7 @@ def repeated(tmp_path):
     return alike, make_job(tmp_path, alike, make_tracks(alike))
 
 
+@pytest.mark.integration
 def test_cameras_from_tracks_are_counted_whether_built_first_or_beside_features(tmp_path):
     job = make_job(tmp_path, walk(), make_tracks(walk()))
     stream = io.BytesIO()
@@ -293,6 +298,7 @@ def test_cameras_from_tracks_are_counted_whether_built_first_or_beside_features(
         assert isinstance(parse(line), Phase | int)
 
 
+@pytest.mark.integration
 def test_tracks_place_what_looks_alike_where_it_is(repeated):
     made, job = repeated
     models = build_skeleton(job, job.database, SILENT)
@@ -395,6 +401,7 @@ def test_photos_that_overlap_by_their_coarsest_features_are_matched_in_full(
     assert max(seen) > 150
 
 
+@pytest.mark.integration
 def test_photos_are_mapped_from_their_matches_where_coarse_features_place_too_few(
     tmp_path, monkeypatch
 ):
@@ -410,6 +417,7 @@ def test_photos_are_mapped_from_their_matches_where_coarse_features_place_too_fe
     assert errors(model, made).max() < 0.02
 
 
+@pytest.mark.integration
 def test_a_photo_without_features_hinders_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr(skeleton, "COARSEST", 120)
     job = make_photos(tmp_path, walk(12))

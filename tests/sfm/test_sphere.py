@@ -81,6 +81,7 @@ def test_true_panoramas_are_trusted(captured):
     assert verdict.trusted, verdict.problems
 
 
+@pytest.mark.integration
 def test_panoramas_in_wrong_places_are_not(captured):
     job, model = captured
     broken = pycolmap.Reconstruction(model)
@@ -94,6 +95,7 @@ def test_panoramas_in_wrong_places_are_not(captured):
     assert not verdict.trusted
 
 
+@pytest.mark.integration
 def test_the_scale_of_a_walk_is_known_the_worse_the_less_exact_its_places_are(tmp_path):
     errors = []
     for noise_px in (0.3, 0.6):
@@ -136,6 +138,7 @@ def test_two_groups_that_meet_in_one_panorama_have_scales_of_their_own(captured,
     assert any("on one side of the cut" in problem for problem in verdict.problems)
 
 
+@pytest.mark.integration
 def test_floor_and_ceiling_give_both_groups_one_scale(captured):
     job, model = captured
     joined = joined_by_a_hinge(model, 0)
@@ -144,6 +147,7 @@ def test_floor_and_ceiling_give_both_groups_one_scale(captured):
     assert scale.off < 0.05
 
 
+@pytest.mark.integration
 def test_points_that_both_groups_see_give_them_one_scale(captured):
     job, model = captured
     verdict = examine(joined_by_a_hinge(model, 12), job.database, job.names)

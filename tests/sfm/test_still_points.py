@@ -26,6 +26,7 @@ def test_the_points_of_a_text_stay_in_their_places():
     assert share == pytest.approx(300 / (300 + 600 * 14 / 16), rel=0.1)
 
 
+@pytest.mark.integration
 def test_a_model_that_a_text_holds_together_is_refused(tmp_path):
     made = walk_under_text(600)
     verdict = examine(made.model(), made.write_database(tmp_path / "database.db"), made.names)
@@ -34,6 +35,7 @@ def test_a_model_that_a_text_holds_together_is_refused(tmp_path):
         check_weak_link(verdict, accept=False)
 
 
+@pytest.mark.integration
 def test_a_few_points_that_stay_do_no_harm(tmp_path):
     made = walk_under_text(9000)
     verdict = examine(made.model(), made.write_database(tmp_path / "database.db"), made.names)

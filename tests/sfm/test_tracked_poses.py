@@ -53,6 +53,7 @@ def errors(model, views):
     return np.sqrt((off**2).sum(axis=1).mean()), np.degrees(turns.magnitude().max())
 
 
+@pytest.mark.integration
 def test_drifted_poses_come_nearer_to_the_truth_and_keep_their_frame(capture):
     job, views = capture
     given = drift(views)
@@ -68,6 +69,7 @@ def test_drifted_poses_come_nearer_to_the_truth_and_keep_their_frame(capture):
         assert np.linalg.norm(center - np.linalg.inv(view)[:3, 3]) < 0.02
 
 
+@pytest.mark.integration
 def test_a_frame_without_matches_is_held_between_its_neighbours(capture):
     job, views = capture
     blank = job.names[10]
@@ -91,6 +93,7 @@ def test_a_frame_without_matches_is_held_between_its_neighbours(capture):
     assert np.linalg.norm(motion[:, 3] - truth[:3, 3]) < 0.02
 
 
+@pytest.mark.integration
 def test_a_frame_without_a_pose_is_placed_by_its_matches(capture):
     job, views = capture
     given = drift(views)
@@ -121,6 +124,7 @@ def test_poses_of_other_pictures_do_not_fit(capture):
     assert check.share < 0.5
 
 
+@pytest.mark.integration
 def test_intrinsics_that_are_known_stay(capture):
     job, views = capture
     found = adjust_tracked(job, drift(views), CAMERAS)

@@ -50,6 +50,7 @@ def small(monkeypatch):
     monkeypatch.setattr(trusted_part, "FEWEST_FRAMES", 3)
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("small")
 def test_of_a_broken_walk_both_sides_are_delivered_the_longer_first(tmp_path):
     made = broken_walk(at=10, count=2400)  # the few that tie both sides wrongly bend a part less
@@ -68,6 +69,7 @@ def test_of_a_broken_walk_both_sides_are_delivered_the_longer_first(tmp_path):
         np.testing.assert_allclose(steps / steps.mean(), truth / truth.mean(), rtol=1e-3)
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("small")
 def test_the_part_that_shows_most_comes_before_one_of_more_frames(tmp_path):
     waiting, walking = np.arange(10) * 0.06, 30 + np.arange(7) * 1.6
@@ -81,12 +83,14 @@ def test_the_part_that_shows_most_comes_before_one_of_more_frames(tmp_path):
     assert held(deliver_parts(job, whole, [onward])) == [made.names[10:], made.names[:10]]
 
 
+@pytest.mark.integration
 def test_a_part_of_few_frames_is_delivered_only_as_the_largest(tmp_path):
     made = broken_walk(at=10)
     job, whole = prepare(made, tmp_path)
     assert held(deliver_parts(job, whole)) == [list(made.names[:10])]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("small")
 def test_two_places_laid_over_each_other_are_two_parts(tmp_path):
     made = doubled_place()
@@ -94,6 +98,7 @@ def test_two_places_laid_over_each_other_are_two_parts(tmp_path):
     assert sorted(held(deliver_parts(job, whole))) == [made.names[:6], made.names[6:]]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("small")
 def test_other_models_of_the_mapper_are_parts_without_what_a_larger_one_holds(tmp_path):
     made = walk()
@@ -115,6 +120,7 @@ def test_another_model_is_cut_where_it_is_broken(tmp_path):
         made.names[3:10], made.names[10:], made.names[:3]]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("small")
 def test_a_model_without_points_gets_those_that_the_matches_give(tmp_path):
     made = walk()
@@ -129,6 +135,7 @@ def test_a_model_without_points_gets_those_that_the_matches_give(tmp_path):
     assert part.model.num_points3D() > 500
 
 
+@pytest.mark.integration
 def test_parts_that_are_too_small_together_are_refused_with_their_size(tmp_path):
     job, whole = prepare(broken_walk(at=10), tmp_path, min_registered=0.7)
     with raises(SfmError, 10, 16, "000000", "together") as refused:
@@ -136,18 +143,21 @@ def test_parts_that_are_too_small_together_are_refused_with_their_size(tmp_path)
     assert "--min-registered" in refused.value.hint
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("small")
 def test_parts_count_together(tmp_path):
     job, whole = prepare(broken_walk(at=10), tmp_path, min_registered=0.7)
     assert len(deliver_parts(job, whole)) == 2
 
 
+@pytest.mark.integration
 def test_a_broken_model_that_shall_not_be_cut_is_refused(tmp_path):
     job, whole = prepare(broken_walk(at=10), tmp_path, partial=False)
     with raises(SfmError, "broken"):
         deliver_parts(job, whole)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("changes", [{"partial": False}, {"accept_weak": True}])
 def test_a_model_that_shall_stay_whole_is_not_cut(tmp_path, changes):
     made = broken_walk(at=10) if "accept_weak" in changes else walk()
@@ -156,11 +166,13 @@ def test_a_model_that_shall_stay_whole_is_not_cut(tmp_path, changes):
     assert part is whole
 
 
+@pytest.mark.integration
 def test_a_sound_model_is_not_cut(tmp_path):
     job, whole = prepare(walk(), tmp_path)
     assert deliver_parts(job, whole) == [whole]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("small")
 def test_a_model_broken_twice_is_cut_twice(tmp_path):
     made = walk(

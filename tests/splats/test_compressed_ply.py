@@ -190,6 +190,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message):
         tracemalloc.stop()
 
 
+@pytest.mark.integration
 @settings(max_examples=examples(200))
 @given(seed=st.integers(0, 2**63), degree=st.integers(0, 3))
 def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed, degree):

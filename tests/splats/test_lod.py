@@ -82,6 +82,7 @@ def test_no_leaf_holds_more_than_it_may_and_boxes_hold_their_children(tmp_path):
             open_nodes.append(child)
 
 
+@pytest.mark.integration
 def test_the_scene_comes_back_as_exactly_as_from_a_sog(tmp_path):
     splats = archive_splats.room(2000)
     written(tmp_path, splats)
@@ -117,6 +118,7 @@ def test_a_single_gaussian_is_one_leaf(tmp_path):
     assert len(load_lod(tmp_path / "lod-meta.json").splats) == 1
 
 
+@pytest.mark.integration
 def test_the_same_scene_gives_the_same_bytes_and_replaces_another(tmp_path):
     written(tmp_path / "a")
     written(tmp_path / "b", archive_splats.room(5000, seed=1))

@@ -231,6 +231,7 @@ def test_what_is_written_is_read_back(degree: int, tmp_path: Path) -> None:
     assert rotation_error(again, splats) < 1e-3
 
 
+@pytest.mark.integration
 def test_more_than_a_chunk_is_written_and_read(tmp_path: Path) -> None:
     splats, path = archive_splats.room(70_000, degree=0), tmp_path / "room.rad"
     write_rad(path, splats)

@@ -110,6 +110,7 @@ def test_view_dependence_survives(tmp_path):
     assert psnr(splats, back) > psnr(splats, splats.with_degree(0)) + 10
 
 
+@pytest.mark.integration
 def test_a_sog_is_a_twelfth_of_a_ply(tmp_path):
     splats = archive_splats.room(20_000)
     write_sog(tmp_path / "a.sog", splats)

@@ -116,6 +116,7 @@ def test_compression_that_does_not_stop_at_a_bound_is_refused(tmp_path, good, me
     refused(tmp_path, pack(good, method), "compressed unusually")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [
     "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp",
     "shN_labels.webp"])
@@ -123,6 +124,7 @@ def test_a_bomb_is_not_unpacked(tmp_path, good, name):
     refused(tmp_path, pack({**good, name: bytes(64 << 20)}), "unpacks to more than")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("claimed", [0, 5, 1 << 31])
 def test_a_size_in_the_directory_that_is_a_lie_is_refused(tmp_path, good, claimed):
     data = bytearray(pack({**good, "sh0.webp": bytes(64 << 20)}))

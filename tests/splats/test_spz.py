@@ -282,6 +282,7 @@ def test_harmonics_of_degree_4_are_cut_to_degree_3_with_a_warning(tmp_path, capl
     assert_facts(caplog.text, 4, 3, "degree")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("version", [3, 4])
 def test_many_equal_gaussians_are_read_back(tmp_path, version):
     """They pack far better than any scene and must not be taken for a bomb."""

@@ -117,6 +117,7 @@ def refused_at(path, limit: int) -> str:
     return str(caught.value)
 
 
+@pytest.mark.integration
 def test_a_gzip_that_unpacks_to_more_than_its_count_is_cut_off(tmp_path):
     path = tmp_path / "a.spz"
     write_spz(path, few())

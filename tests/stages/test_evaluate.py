@@ -30,6 +30,7 @@ def inputs(tiny_pruned):
     return tiny_pruned
 
 
+@pytest.mark.integration
 def test_evaluation_scores_exactly_what_it_wrote(inputs, tmp_path):
     out = tmp_path / "out"
     run(evaluate, EvaluateConfig(), inputs, out)
@@ -80,6 +81,7 @@ def test_views_that_training_saw_are_scored_beside_the_held_out_ones(inputs, tmp
     assert model["seen_psnr_db"]["training"] > model["psnr_db"]
 
 
+@pytest.mark.integration
 def test_scores_are_against_the_original_pixels_also_where_training_saw_denoised_ones(
     inputs, tmp_path
 ):
@@ -172,6 +174,7 @@ def test_trust_is_measured_checked_on_held_out_views_and_drawn(inputs, tmp_path)
     assert all(line.startswith("poorly seen (") for line in summary.poorly_seen)
 
 
+@pytest.mark.integration
 def test_trust_renders_no_view_again_that_scoring_rendered(inputs, tmp_path, monkeypatch):
     drawn = []
     render_view = reference_views.render_view

@@ -37,6 +37,7 @@ def exported(tiny_learnt, tmp_path_factory):
     return out, run_export(ExportConfig(format=",".join(ASKED)), tiny_learnt, out, CONTEXT)
 
 
+@pytest.mark.integration
 def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported, inputs):
     out, summary = exported
     assert set(summary.files) == set(ASKED) - {"ply"}
@@ -54,6 +55,7 @@ def test_every_format_lies_beside_the_ply_and_shows_the_same_scene(exported, inp
     assert abs(summary.files["glb"].psnr_change_db) < 1e-3  # it keeps every value
 
 
+@pytest.mark.integration
 def test_cameras_are_those_of_the_scene(exported, inputs):
     out, _ = exported
     found = {name: viewmat for name, _, viewmat in read_images(out / "sparse" / "0" / "images.bin")}
@@ -67,6 +69,7 @@ def test_cameras_are_those_of_the_scene(exported, inputs):
     assert {name.removeprefix("images/") for name in transforms["test_filenames"]} == held_out
 
 
+@pytest.mark.integration
 def test_the_images_of_the_cameras_lie_beside_them(exported, inputs):
     out, _ = exported
     transforms = json.loads((out / "transforms.json").read_text())

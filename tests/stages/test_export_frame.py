@@ -98,6 +98,7 @@ def most_apart(one, other):
     return max(float((one[name] - other[name]).abs().max()) for name in one)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("options", [
     {"transform": flat(MOVED)},
     {"transform": flat(MOVED), "scale_between": ("000000.png", "000006.png", 3.0)},
@@ -118,6 +119,7 @@ def test_files_and_cameras_that_are_handed_out_show_the_same_pictures(inputs, op
             assert most_apart(before, after) < 0.05, name
 
 
+@pytest.mark.integration
 def test_harmonics_that_did_not_turn_would_be_seen(inputs):
     """The bound above means nothing unless this exceeds it."""
     out, _ = exported(inputs, format="colmap", transform=flat(MOVED))
@@ -196,6 +198,7 @@ def test_a_ply_and_an_spz_say_which_axis_is_up(inputs, name, comment):
     assert torch.allclose(back.means[:20], read_ply(out / "splats.ply").means[:20], atol=1e-3)
 
 
+@pytest.mark.integration
 def test_a_page_stands_upright_in_any_frame(inputs):
     up_is_z(inputs)
     out, _ = exported(inputs, format="html", transform=flat(MOVED))

@@ -70,6 +70,7 @@ def test_without_its_backdrop_a_scene_is_on_black_and_the_loss_is_said(inputs, w
         psnr.psnr_db(back) - psnr.psnr_db(whole), abs=1e-3)
 
 
+@pytest.mark.integration
 def test_files_are_bounded_but_the_page_and_what_is_kept(inputs, whole, tmp_path):
     far = replace(whole, means=whole.means.clone())
     row = int(far.means.norm(dim=1).argmax())
@@ -160,6 +161,7 @@ def test_a_palette_that_loses_too_much_gets_more_entries(inputs, tmp_path):
     assert large.bytes > small.bytes
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["ply", "spz", "sog"])
 def test_a_file_is_no_larger_than_asked_for(inputs, whole, tmp_path, name):
     exported(inputs, tmp_path, format=name, backdrop="drop")

@@ -42,6 +42,7 @@ def test_training_leaves_a_scene_its_states_and_a_log(inputs):
     assert rows[-1]["validation_psnr_db"] > mean_colour_psnr(inputs) + 2
 
 
+@pytest.mark.integration
 def test_two_runs_give_the_same_bytes(inputs, tmp_path):
     run(train, CONFIG, inputs, tmp_path / "again")
     for name in ("splats.ply", "mid.safetensors", "final.safetensors"):
@@ -49,6 +50,7 @@ def test_two_runs_give_the_same_bytes(inputs, tmp_path):
             inputs.folders["train"] / name).read_bytes(), name
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("steps", [7, 91, 98])
 def test_a_killed_training_ends_with_the_bytes_of_an_uninterrupted_one(
     inputs, tmp_path, monkeypatch, steps
@@ -101,6 +103,7 @@ def test_pruning_at_mid_halves_the_count_and_both_models_saw_as_many_steps(input
     assert (inputs.folders["train"] / "splats.ply").exists()
 
 
+@pytest.mark.integration
 def test_a_killed_recovery_ends_with_the_same_bytes(inputs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         kill_after(119, patch)

@@ -10,13 +10,14 @@ from tiny_scene import make_inputs
 from tiny_stages import run_export
 
 from recon_cli.config.export import ExportConfig
-from recon_cli.config.stages import EvaluateConfig, PruneConfig, TrainConfig
+from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.export import verify
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import evaluate, export, prune, train
 from recon_cli.train.fit import runner
 from recon_cli.train.fit.state import save_state
+from recon_cli.train.fit.train_data import write_config
 
 CONTEXT = StageContext(backend="numba")
 
@@ -37,6 +38,7 @@ def trained(request, tmp_path_factory):
     return request.param, StageInputs({**given.folders, "train": folder / "train"})
 
 
+@pytest.mark.integration
 def test_a_low_degree_is_stored_from_the_first_step_to_the_file(trained):
     degree, inputs = trained
     terms = (degree + 1) ** 2 - 1
@@ -49,6 +51,7 @@ def test_a_low_degree_is_stored_from_the_first_step_to_the_file(trained):
     assert read_ply(path).sh_degree == degree
 
 
+@pytest.mark.integration
 def test_a_killed_training_of_a_low_degree_ends_with_the_same_bytes(
     trained, tmp_path, monkeypatch
 ):
@@ -95,6 +98,7 @@ def test_an_export_of_any_degree_and_share_is_read_back(tmp_path, degree, colore
     (tmp_path / "train").mkdir()
     (tmp_path / "out").mkdir()
     write_ply(tmp_path / "train" / "splats.ply", splats)
+    write_config(tmp_path / "train", RunConfig(sh_degree=degree))
     inputs = StageInputs({**inputs.folders, "train": tmp_path / "train"})
     summary = run_export(ExportConfig(backdrop="keep"), inputs, tmp_path / "out", CONTEXT)
     assert summary.gaussians == 30

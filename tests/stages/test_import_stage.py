@@ -272,6 +272,7 @@ def test_an_spz_that_does_not_fit_the_views_is_said_to_have_other_axes_perhaps(i
     assert summary.frame == "workspace"
 
 
+@pytest.mark.integration
 def test_what_was_trained_with_antialiasing_is_recorded_said_and_exported(tmp_path):
     write_ply(tmp_path / "a.ply", truth(), comments=["SplatRenderMode: mip"])
     summary = brought_in(tmp_path / "a.ply", None, tmp_path / "train")

@@ -102,6 +102,7 @@ def test_without_views_nothing_is_pruned_or_scored(alone, verb, capsys):
     assert "recon ingest VIDEO" in capsys.readouterr().err
 
 
+@pytest.mark.integration
 def test_training_does_not_replace_an_imported_scene_unasked(workspace, scene, capsys):
     assert recon("import", workspace, scene) == 0
     before = (workspace / "train" / "splats.ply").read_bytes()
@@ -114,6 +115,7 @@ def test_training_does_not_replace_an_imported_scene_unasked(workspace, scene, c
     assert not (workspace / "train" / "import.json").exists()
 
 
+@pytest.mark.integration
 def test_an_import_does_not_replace_a_trained_scene_unasked(workspace, scene, capsys):
     assert recon("train", workspace, "--iterations", "5", "--max-size", "48") == 0
     before = (workspace / "train" / "splats.ply").read_bytes()
@@ -134,6 +136,7 @@ def test_a_file_that_cannot_be_read_leaves_everything_as_it_was(alone, tmp_path,
     assert states(alone)["train"] == "fresh"
 
 
+@pytest.mark.integration
 def test_with_views_later_stages_follow_the_scene(workspace, scene, tmp_path):
     assert recon("import", workspace, scene) == 0
     assert recon("eval", workspace) == 0

@@ -38,6 +38,7 @@ def notices(caplog):
     return lambda: [record.getMessage() for record in caplog.records]
 
 
+@pytest.mark.integration
 def test_a_video_becomes_sharp_frames_and_a_list_of_them(video, tmp_path, notices):
     summary = take(video, tmp_path / "out")
     found = listed(tmp_path / "out")
@@ -73,16 +74,19 @@ def test_the_bundled_video_gives_a_number_that_structure_from_motion_likes(sampl
     assert (summary.width, summary.height, summary.lost_frames) == (600, 340, 0)
 
 
+@pytest.mark.integration
 def test_as_many_frames_as_asked_for_are_taken(video, tmp_path, notices):
     assert take(video, tmp_path / "out", config=IngestConfig(frames=17)).frames == 17
     assert notices() == []
 
 
+@pytest.mark.integration
 def test_asking_for_more_frames_than_there_are_is_noticed(video, tmp_path, notices):
     assert take(video, tmp_path / "out", config=IngestConfig(frames=50)).frames == 40
     assert notices() == ["50 frames were requested, but walk.mp4 has 40."]
 
 
+@pytest.mark.integration
 def test_asking_for_more_frames_than_are_sharp_is_noticed(tmp_path, notices):
     frames = walk(40)
     for index in (5, 11, 17):
@@ -96,6 +100,7 @@ def test_asking_for_more_frames_than_are_sharp_is_noticed(tmp_path, notices):
     assert not (tmp_path / "out" / "frames" / "000011.png").exists()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("frames", [None, 12, 30])
 def test_of_repeated_pictures_of_a_video_one_is_taken(tmp_path, notices, frames):
     views = walk(15)
@@ -114,6 +119,7 @@ def test_of_repeated_pictures_of_a_video_one_is_taken(tmp_path, notices, frames)
         "repeat one of them."])
 
 
+@pytest.mark.integration
 def test_a_slide_show_of_two_pictures_is_refused(tmp_path):
     views = walk(9)
     video = write_video(tmp_path / "slides.mp4", [views[8 * (index // 20)] for index in range(40)])
@@ -121,10 +127,12 @@ def test_a_slide_show_of_two_pictures_is_refused(tmp_path):
         take(video, tmp_path / "out")
 
 
+@pytest.mark.integration
 def test_the_automatic_number_stays_under_its_bound(video, tmp_path):
     assert take(video, tmp_path / "out", config=IngestConfig(max_frames=9)).frames == 9
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["video", "photos"])
 def test_what_was_kept_and_dropped_is_recorded_and_drawn(video, tmp_path, kind):
     source = video if kind == "video" else write_photos(tmp_path / "room", 6)
@@ -149,6 +157,7 @@ def test_photos_of_the_same_view_are_left_out_and_named(tmp_path, notices):
     assert files(tmp_path / "out") == before
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("holdout", "expected"), [
     ("every:8", [0, 8, 16]), ("segment:0.25:0.5", [5, 6, 7, 8, 9]), ("none", [])])
 def test_held_out_frames_are_frozen_here(video, tmp_path, holdout, expected):
@@ -157,6 +166,7 @@ def test_held_out_frames_are_frozen_here(video, tmp_path, holdout, expected):
     assert [place for place, frame in enumerate(frames) if frame["held_out"]] == expected
 
 
+@pytest.mark.integration
 def test_long_frames_are_reduced_with_a_notice(video, tmp_path, notices):
     config = IngestConfig(frames=5, max_size=64)
     summary = take(video, tmp_path / "out", config=config)
@@ -230,6 +240,7 @@ def test_no_metadata_is_carried_over_and_the_focal_length_is_scaled(tmp_path):
 
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("milliseconds", "count"), [(100, 100), (500, 110)])
 def test_photos_of_a_walk_that_were_taken_two_a_second_are_all_kept(
         tmp_path, milliseconds, count):
@@ -244,6 +255,7 @@ def test_photos_of_a_walk_that_were_taken_two_a_second_are_all_kept(
 # Crashes
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["video", "photos", "sequence"])
 def test_an_interrupted_run_goes_on_where_it_was_and_ends_the_same(
         video, tmp_path, monkeypatch, kind):
@@ -280,6 +292,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_the_same(
     assert {name: (frames / name).stat().st_mtime_ns for name in before} == before
 
 
+@pytest.mark.integration
 def test_a_second_try_does_not_scan_the_video_again(video, tmp_path, monkeypatch):
     take(video, tmp_path / "out")
     before = files(tmp_path / "out")
@@ -345,6 +358,7 @@ def round_pictures(frames):
     return [frame * disk for frame in frames]
 
 
+@pytest.mark.integration
 def test_the_border_of_a_fisheye_video_is_masked_or_kept_on_request(tmp_path, notices):
     video = write_video(
         tmp_path / "round.mp4", round_pictures(walk(40, step=6, height=180, width=320)))
@@ -398,6 +412,7 @@ def test_what_covers_too_much_of_the_picture_is_not_masked(marked, tmp_path, mon
     assert any("nothing is masked" in notice for notice in notices())
 
 
+@pytest.mark.integration
 def test_progress_that_would_survive_a_crash_is_recorded(video, tmp_path):
     seen = []
     out = tmp_path / "out"
@@ -422,6 +437,7 @@ def test_phone_videos_come_out_upright_and_complete(shared_data, tmp_path, name,
     assert summary.dropped_blurred > 0
 
 
+@pytest.mark.integration
 def test_what_was_done_to_a_video_is_said_once_for_each_thing(tmp_path, notices):
     path = media.write_video(tmp_path / "wide.mp4", walk(40), aspect=Fraction(4, 3))
     summary = take(path, tmp_path / "out")
@@ -430,6 +446,7 @@ def test_what_was_done_to_a_video_is_said_once_for_each_thing(tmp_path, notices)
         "wide.mp4 has pixels of aspect 4/3: its frames of 128x96 are stretched to 171x96."]
 
 
+@pytest.mark.integration
 def test_many_frames_are_told_in_advance(
     video, tmp_path, notices, monkeypatch
 ):

@@ -34,6 +34,7 @@ def best_shot(pixels, taken):
     return taken[int(np.argmin(off))], min(off)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", APPS)
 def test_pictures_and_poses_belong_together_and_end_with_z_up(name, frames, still, tmp_path):
     app = APPS[name]
@@ -67,6 +68,7 @@ def test_pictures_and_poses_belong_together_and_end_with_z_up(name, frames, stil
     assert set(found) == {shot.number for shot in taken}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [name for name, app in APPS.items() if app.depth])
 def test_depth_is_stored_at_the_size_of_the_sensor(name, frames, tmp_path):
     APPS[name].write(tmp_path / "capture", frames)
@@ -91,6 +93,7 @@ def test_depth_is_stored_at_the_size_of_the_sensor(name, frames, tmp_path):
         assert np.median(depth) == pytest.approx(np.median(shot.depth), abs=1e-2)
 
 
+@pytest.mark.integration
 def test_a_packed_recording_gives_what_the_folder_gives(frames, tmp_path):
     APPS["r3d"].write(tmp_path / "folder", frames)
     take(tmp_path / "folder", tmp_path / "one")
@@ -103,6 +106,7 @@ def test_a_packed_recording_gives_what_the_folder_gives(frames, tmp_path):
             assert (out / "depth" / path.name).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.integration
 def test_fewer_frames_of_a_video_are_still_those_of_their_rows(shared_data, tmp_path):
     frames = shots(shared_data / "rooms" / "office")
     stray(tmp_path / "walk", frames, between=1)

@@ -247,6 +247,7 @@ def room_with_depth(folder, room, unit, suffix=".npy"):
     return folder
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("unit", "suffix"), [
     (1e-3, ".png"), (1.0, ".npy"), (1 / 4000, ".png"), (1 / 5000, ".png")])
 def test_depth_in_another_unit_gives_points_where_the_room_is(
@@ -261,6 +262,7 @@ def test_depth_in_another_unit_gives_points_where_the_room_is(
     assert any("The depth fits the poses in" in text for text in notices()) == (unit != 1e-3)
 
 
+@pytest.mark.integration
 def test_depth_that_fits_in_no_unit_gives_neither_points_nor_metres(
     tmp_path, shared_data, notices
 ):

@@ -26,6 +26,7 @@ def notices(caplog):
     return lambda: [record.getMessage() for record in caplog.records]
 
 
+@pytest.mark.integration
 def test_a_video_cut_off_goes_on_with_what_is_left(video, tmp_path, notices):
     data = video.read_bytes()
     video.write_bytes(data[:len(data) // 2])
@@ -94,6 +95,7 @@ def test_a_video_from_a_tripod_is_refused(tmp_path):
         take(video, tmp_path / "out")
 
 
+@pytest.mark.integration
 def test_a_video_that_is_dark_for_the_most_part_is_told(tmp_path, notices):
     lit = walk(30)
     take(write_video(tmp_path / "room.mp4", [*lit[:10], *(frame // 64 for frame in lit[10:])]),
@@ -101,6 +103,7 @@ def test_a_video_that_is_dark_for_the_most_part_is_told(tmp_path, notices):
     assert_facts(notices()[0], "20 of 30 frames", "room.mp4", "black")
 
 
+@pytest.mark.integration
 def test_adjacent_frames_are_warned_of(tmp_path, notices):
     wide = blocks(384, 560)  # a third of a percent of the width a frame, as at 60 a second
     take(write_video(tmp_path / "short.mp4", [wide[:, i:i + 384] for i in range(12)]),
@@ -247,6 +250,7 @@ def test_an_archive_or_poses_are_not_read_as_a_video(tmp_path):
         take(tmp_path / "cameras.json", tmp_path / "out")
 
 
+@pytest.mark.integration
 def test_poses_beside_the_video_of_an_app_are_named(tmp_path, notices):
     (tmp_path / "stray").mkdir()
     video = write_video(tmp_path / "stray" / "rgb.mp4", walk(20))

@@ -160,6 +160,7 @@ def test_photos_of_one_name_are_not_told_apart(tmp_path):
         take(tuple(paths), tmp_path / "out")
 
 
+@pytest.mark.integration
 def test_a_folder_of_all_frames_of_a_video_is_thinned_like_one(tmp_path, notices):
     folder = write_sequence(tmp_path / "dump", 110)
     summary = take(folder, tmp_path / "out", config=IngestConfig(frames=24))
@@ -194,12 +195,14 @@ def test_the_number_of_frames_of_a_sequence_can_be_set_up_to_all(tmp_path, notic
     assert len(notices()) == 1
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("count", [99, 100, 101, 104])
 def test_no_photo_more_costs_a_short_walk_its_views(tmp_path, count):
     folder = write_sequence(tmp_path / "dump", count)
     assert take(folder, tmp_path / "out").frames == min(count, 100)
 
 
+@pytest.mark.integration
 def test_photos_that_follow_each_other_get_tracks_by_the_names_of_their_frames(tmp_path):
     folder = write_sequence(tmp_path / "dump", 40)
     for path in folder.iterdir():
@@ -225,6 +228,7 @@ def test_of_frames_that_are_there_twice_one_is_taken(tmp_path):
     assert (summary.frames, summary.decoded_frames) == (30, 60)
 
 
+@pytest.mark.integration
 def test_tracks_leave_out_what_a_mask_hides(tmp_path):
     folder = write_sequence(tmp_path / "dump", 30)
     mask = np.full((192, 256), 255, np.uint8)
@@ -236,6 +240,7 @@ def test_tracks_leave_out_what_a_mask_hides(tmp_path):
     assert left[9] > 0 == left[10]
 
 
+@pytest.mark.integration
 def test_a_copy_beside_a_sequence_is_left_out_and_what_shows_more_is_kept(tmp_path, notices):
     folder = tmp_path / "dump"
     folder.mkdir()
@@ -249,6 +254,7 @@ def test_a_copy_beside_a_sequence_is_left_out_and_what_shows_more_is_kept(tmp_pa
     assert_facts("\n".join(notices()), "copy.jpg", "frame_0020.jpg")
 
 
+@pytest.mark.integration
 def test_pictures_of_another_scene_are_set_aside_by_name(tmp_path, notices):
     folder = write_sequence(tmp_path / "dump", 60)
     for index, name in enumerate(("frame_0021.jpg", "frame_0041.jpg", "cat.jpg")):
@@ -262,6 +268,7 @@ def test_pictures_of_another_scene_are_set_aside_by_name(tmp_path, notices):
                               tracks.names.index("frame_0022.png"))[0]) > 15
 
 
+@pytest.mark.integration
 def test_a_few_pictures_of_another_size_are_set_aside_unless_they_show_the_scene(tmp_path, notices):
     folder = tmp_path / "room"
     write_photos(folder, 18, size=(256, 192))
@@ -273,6 +280,7 @@ def test_a_few_pictures_of_another_size_are_set_aside_unless_they_show_the_scene
     assert_facts(notices()[0], "set aside", "x.png")
 
 
+@pytest.mark.integration
 def test_a_broken_photo_of_a_sequence_is_left_out_and_named(tmp_path, notices):
     folder = write_sequence(tmp_path / "dump", 60)
     damaged = folder / "frame_0030.jpg"

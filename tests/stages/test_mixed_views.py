@@ -51,6 +51,7 @@ def mean_colour_psnr(image):
     return psnr(mean, image)
 
 
+@pytest.mark.integration
 def test_views_of_both_cameras_are_learned_and_scored_at_their_own_size(done, tmp_path):
     inputs, _, ctx = done
     metrics = evaluated(inputs, tmp_path / "out", ctx)
@@ -65,6 +66,7 @@ def test_views_of_both_cameras_are_learned_and_scored_at_their_own_size(done, tm
                 psnr((render / 255).astype(np.float32), truth), abs=0.15)
 
 
+@pytest.mark.integration
 def test_summaries_and_metrics_name_the_largest_size_and_all_of_them(done, tmp_path):
     inputs, (summary, _), ctx = done
     metrics = evaluated(inputs, tmp_path / "out", ctx)
@@ -74,12 +76,14 @@ def test_summaries_and_metrics_name_the_largest_size_and_all_of_them(done, tmp_p
     assert_facts((tmp_path / "out" / "table.txt").read_text(), 3, "48x36", "30x44")
 
 
+@pytest.mark.integration
 def test_each_camera_is_reduced_to_the_longest_side_by_its_own_factor(done, tmp_path):
     inputs, _, ctx = done
     metrics = evaluated(inputs, tmp_path / "out", ctx, EvaluateConfig(max_size=32))
     assert metrics["sizes"] == [[32, 24], [22, 32]]
 
 
+@pytest.mark.integration
 def test_pruning_keeps_its_share_over_both_cameras(done):
     _, (_, summary), _ = done
     before = summary.gaussians_before

@@ -72,6 +72,7 @@ def mapped(room, tmp_path_factory):
     return out, run(room, out, ctx=ctx, max_features=FEATURES), seen
 
 
+@pytest.mark.integration
 def test_every_frame_that_shows_the_room_gets_a_camera(mapped):
     _, summary, _ = mapped
     assert summary.frames == COUNT + 1
@@ -79,6 +80,7 @@ def test_every_frame_that_shows_the_room_gets_a_camera(mapped):
     assert summary.unregistered == summary.unregistered_held_out == (BLANK,)
 
 
+@pytest.mark.integration
 def test_the_summary_is_json_and_has_plausible_figures(mapped):
     _, summary, _ = mapped
     text = json.dumps(summary.to_json(), allow_nan=False)
@@ -94,6 +96,7 @@ def test_the_summary_is_json_and_has_plausible_figures(mapped):
     assert camera["focal_px"] == pytest.approx(300, rel=0.03)  # the room was rendered with 300
 
 
+@pytest.mark.integration
 def test_camera_centres_agree_with_the_rendered_path(mapped, shared_data):
     out, _, _ = mapped
     lines = (shared_data / "rooms" / "office" / "traj.txt").read_text().splitlines()
@@ -114,6 +117,7 @@ def similarity_rmse(found, truth):
     return np.sqrt(((scale * a @ (u @ flip @ vt).T - b) ** 2).sum(axis=1).mean())
 
 
+@pytest.mark.integration
 def test_the_scene_can_be_read_with_its_twins(mapped):
     out, summary, _ = mapped
     scene = read_scene(
@@ -127,6 +131,7 @@ def test_the_scene_can_be_read_with_its_twins(mapped):
         summary.cameras[0]["width"], summary.cameras[0]["height"])
 
 
+@pytest.mark.integration
 def test_twins_are_identical_exactly_where_nothing_was_denoised(mapped):
     out, _, _ = mapped
     images, twins = out / "undistorted" / "images", out / "undistorted" / "denoised"
@@ -138,6 +143,7 @@ def test_twins_are_identical_exactly_where_nothing_was_denoised(mapped):
     assert np.abs(difference).mean() < 20  # the same view, blurred
 
 
+@pytest.mark.integration
 def test_undistortion_keeps_pixels_and_has_no_blank_border(mapped):
     out, _, _ = mapped
     rgb = read_png(out / "undistorted" / "images" / "000012.png")
@@ -145,6 +151,7 @@ def test_undistortion_keeps_pixels_and_has_no_blank_border(mapped):
     assert (edges.max(axis=1) > 0).all()
 
 
+@pytest.mark.integration
 def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
     out, _, _ = mapped
     assert sorted(path.name for path in out.iterdir()) == [
@@ -159,6 +166,7 @@ def test_the_folder_holds_what_others_read_and_no_leftovers(mapped):
         assert sorted(path.name for path in folder.iterdir()) == list(MODEL)
 
 
+@pytest.mark.integration
 def test_progress_is_recorded_in_order_up_to_the_last_step(mapped):
     _, _, seen = mapped
     mapping = [each for each in seen if each[1] == len(STEPS) * (COUNT + 1)]
@@ -256,6 +264,7 @@ def read_pairs(out):
                 for table in ("matches", "two_view_geometries")]
 
 
+@pytest.mark.integration
 def test_a_finished_run_is_not_done_again(mapped, room):
     out, summary, _ = mapped
     before = (out / "parts").stat().st_ino
@@ -263,6 +272,7 @@ def test_a_finished_run_is_not_done_again(mapped, room):
     assert (out / "parts").stat().st_ino == before
 
 
+@pytest.mark.integration
 def test_running_out_of_time_is_a_failure_that_says_where_it_was(room, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(SfmError, match=r"within 0\.01 minutes.*\bstep\b") as caught:
@@ -272,6 +282,7 @@ def test_running_out_of_time_is_a_failure_that_says_where_it_was(room, tmp_path)
     assert not workers()
 
 
+@pytest.mark.integration
 def test_a_mapping_process_that_dies_is_a_failure_that_names_its_log(room, tmp_path):
     def kill():
         while not (found := workers()) or not (tmp_path / "out" / "database.db").exists():
@@ -287,6 +298,7 @@ def test_a_mapping_process_that_dies_is_a_failure_that_names_its_log(room, tmp_p
     assert "memory" in caught.value.hint
 
 
+@pytest.mark.integration
 def test_an_interrupt_ends_the_mapping_process_and_goes_on(room, tmp_path):
     def interrupt(*_):
         raise KeyboardInterrupt

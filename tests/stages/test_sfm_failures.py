@@ -29,12 +29,14 @@ from recon_cli.workspace.summaries import (
 )
 
 
+@pytest.mark.integration
 def test_a_grey_video_is_said_to_show_no_texture(tmp_path):
     grey = {f"{index:06d}.png": np.full((120, 160, 3), 90, np.uint8) for index in range(5)}
     with raises(SfmError, 0, 5, "features"):
         run(write_inputs(tmp_path, grey), tmp_path / "out")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("pairs", "count"), [
     ("exhaustive", 66),
     ("sequential", 65),  # all but the first with the last: neighbours reach 10 frames far
@@ -92,6 +94,7 @@ def test_what_is_short_or_not_known_is_not_told(tmp_path, monkeypatch, changes):
     assert told_times(tmp_path, monkeypatch, **changes) == []
 
 
+@pytest.mark.integration
 def test_frames_that_show_different_things_are_said_to_do_so(tmp_path):
     images = {f"{seed}.png": texture(180, 240, seed) for seed in range(4)}
     with raises(SfmError, "frames", "match"):
@@ -110,6 +113,7 @@ def test_a_missing_twin_is_found_before_anything_is_done(tmp_path):
     assert not (tmp_path / "out" / "log.txt").exists()
 
 
+@pytest.mark.integration
 def test_a_broken_frame_is_an_error_of_the_file_not_of_the_mapping(tmp_path):
     base = write_inputs(
         tmp_path, {f"{index}.png": np.zeros((48, 64, 3), np.uint8) for index in range(3)})
@@ -195,6 +199,7 @@ def test_every_further_way_to_a_model_is_told_with_its_reason(caplog):
     assert "exhaustive" not in text
 
 
+@pytest.mark.integration
 def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     grey = {f"{index}.png": np.full((60, 80, 3), 90, np.uint8) for index in range(3)}

@@ -59,6 +59,7 @@ def found(out):
     return {name: viewmat for name, _, viewmat in read_images(out / "sparse" / "images.bin")}
 
 
+@pytest.mark.integration
 def test_poses_and_points_that_are_kept_are_written_as_they_were_given(
     room, truth, given, tmp_path
 ):
@@ -102,6 +103,7 @@ def test_wrong_poses_are_refused_although_points_came_with_them(
     assert not (tmp_path / "out" / "sparse").exists()
 
 
+@pytest.mark.integration
 def test_wrong_poses_that_are_kept_are_refused_before_all_images_are_looked_at(
     room, truth, given, tmp_path
 ):
@@ -140,6 +142,7 @@ def test_a_place_that_does_not_exist_is_told_before_anything_is_mapped(
     assert not list((tmp_path / "out").iterdir())
 
 
+@pytest.mark.integration
 def test_points_are_triangulated_from_poses_that_stay_where_they_are(room, truth, given, tmp_path):
     given({name: viewmat for name, viewmat in truth.items() if name != POSELESS})
     summary = run_here(room, tmp_path / "out")

@@ -77,6 +77,7 @@ def placed(out):
     return tuple(name for name, *_ in read_images(out / "sparse" / "images.bin"))
 
 
+@pytest.mark.integration
 def test_the_largest_part_is_placed_and_the_other_one_is_kept(mapped, first):
     found, summary = mapped[1], first[1]
     assert tuple(part.names for part in found.parts) == PARTS
@@ -94,6 +95,7 @@ def test_the_largest_part_is_placed_and_the_other_one_is_kept(mapped, first):
     assert PlaceSummary.from_json(json.loads(json.dumps(summary.to_json()))) == summary
 
 
+@pytest.mark.integration
 def test_the_other_part_is_placed_from_the_same_models(mapped, first, base, tmp_path):
     before = {path: path.read_bytes() for path in mapped[0].rglob("*") if path.is_file()}
     taken = place(base, mapped, tmp_path / "out", part=2)
@@ -110,6 +112,7 @@ def test_the_other_part_is_placed_from_the_same_models(mapped, first, base, tmp_
     assert not place(base, mapped, tmp_path / "out", gravity="off").world.evidence.up_found
 
 
+@pytest.mark.integration
 def test_a_part_that_there_is_not_is_refused_with_those_that_there_are(mapped, base, tmp_path):
     with pytest.raises(ConfigError) as refused:
         place(base, mapped, tmp_path / "out", part=3)
@@ -117,6 +120,7 @@ def test_a_part_that_there_is_not_is_refused_with_those_that_there_are(mapped, b
     assert "recon sfm --part 2" in refused.value.hint
 
 
+@pytest.mark.integration
 def test_a_run_that_was_killed_ends_with_the_bytes_of_one_that_was_not(
     first, mapped, base, tmp_path
 ):
@@ -133,12 +137,14 @@ def test_a_run_that_was_killed_ends_with_the_bytes_of_one_that_was_not(
         first[0] / name).read_bytes()]
 
 
+@pytest.mark.integration
 def test_parts_that_hold_too_few_frames_together_are_refused(base, tmp_path):
     assert len(run(base, matched(tmp_path / "few"), min_registered=1.0).parts) == 2
     with raises(SfmError, LARGE, LARGE + SMALL, "frames"):
         run(base, matched(tmp_path / "whole"), min_registered=0.6, partial=False)
 
 
+@pytest.mark.integration
 def test_the_notices_name_each_part_and_how_to_take_another_one(mapped, base, tmp_path, caplog):
     place(base, mapped, tmp_path / "out", part=2)
     for facts in (("2 parts", "part 2 is used"), ("recon sfm --part 1", "recon report"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from tiny_stages import CONFIG, run, without
 
 from recon_cli.config.stages import EvaluateConfig
@@ -18,6 +19,7 @@ from recon_cli.stages import evaluate, train
 from recon_cli.workspace.summaries import PhotometrySummary
 
 
+@pytest.mark.integration
 def test_evaluation_shades_renders_by_the_vignette_that_training_found(tiny_pruned, tmp_path):
     inputs, out = without(tiny_pruned, "prune"), tmp_path / "train"
     summary = run(train, replace(CONFIG, vignette="on", iterations=60), inputs, out)

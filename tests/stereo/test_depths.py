@@ -38,6 +38,7 @@ def depths_of(views, guess=3.0, gains=None):
     return find_depths(photos, partners_of([view.camera for view in views]), NEAR)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("slant", [0.0, 0.4])
 def test_a_wall_with_texture_is_found_to_a_quarter_of_a_percent(slant):
     error, share = errors(AROUND, depths_of(views_of(AROUND, grain, slant), 2.6), slant)
@@ -46,12 +47,14 @@ def test_a_wall_with_texture_is_found_to_a_quarter_of_a_percent(slant):
     assert np.quantile(error, 0.9) < 0.01
 
 
+@pytest.mark.integration
 def test_shading_alone_tells_the_depth_of_a_painted_wall():
     error, share = errors(AROUND, depths_of(views_of(AROUND, shading), 2.4))
     assert share > 0.6
     assert np.median(error) < 0.02
 
 
+@pytest.mark.integration
 def test_a_wall_of_one_colour_says_nothing_that_other_views_confirm():
     """All hypotheses cost the same: nothing is better than the first."""
     views = views_of(AROUND, lambda places: np.full(places.shape[:2], 130.0))
@@ -85,6 +88,7 @@ def test_a_wider_angle_than_the_best_is_preferred_to_one_as_far_below_it():
     assert list(partners[0][:2]) == [2, 1]
 
 
+@pytest.mark.integration
 def test_any_number_of_threads_gives_the_same_bytes(monkeypatch):
     views = views_of(AROUND[:4], grain)
     results = []
@@ -94,6 +98,7 @@ def test_any_number_of_threads_gives_the_same_bytes(monkeypatch):
     assert results[0] == results[1]
 
 
+@pytest.mark.integration
 def test_images_of_different_sizes_are_compared():
     cameras = [*AROUND[:5], *(camera(view.center, width=96, height=128) for view in AROUND[5:])]
     found = depths_of(views_of(cameras, grain), 2.6)
@@ -104,6 +109,7 @@ def test_images_of_different_sizes_are_compared():
         assert np.median(np.abs(depth[there] / truth[there] - 1)) < 0.003
 
 
+@pytest.mark.integration
 def test_masked_pixels_have_no_depth():
     mask = np.ones((HEIGHT, AROUND[0].width), bool)
     mask[:, :60] = False
@@ -113,6 +119,7 @@ def test_masked_pixels_have_no_depth():
     assert (found[:, :, 60:] > 0).mean() > 0.7
 
 
+@pytest.mark.integration
 def test_views_of_other_exposures_are_compared_at_the_mean_one():
     """A painted wall: without their gains no grey levels agree."""
     gains = np.exp(np.linspace(-0.15, 0.15, len(AROUND)))
@@ -166,6 +173,7 @@ def ceiling_depths(views, truths, levels=None, on_photo=lambda: None):
     return np.stack(find_depths(photos, partners, NEAR, on_photo, levels=levels))
 
 
+@pytest.mark.integration
 def test_level_planes_find_more_of_a_white_ceiling():
     views, truths = ceiling_views()
     right = []

@@ -292,6 +292,7 @@ def test_steps_of_several_views_go_ahead_to_the_same_bits(monkeypatch):
     assert_same(held(stopped), held(state))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("views", [1, 2])
 def test_a_step_never_waits_for_the_device(views):
     config = dataclasses.replace(CONFIG, batch_views=views)

@@ -46,6 +46,7 @@ def test_a_step_takes_the_mean_of_its_views_gradients(backend, monkeypatch):
         assert (value - mean).norm() <= 1e-6 * mean.norm(), name
 
 
+@pytest.mark.integration
 def test_backends_walk_the_same_way_in_steps_of_several_views():
     config, states = with_batches(3), {}
     for backend in ("torch", "numba"):
@@ -70,6 +71,7 @@ def test_a_batch_of_the_same_view_moves_like_the_view_alone(backend):
     assert torch.equal(twice.gathered.radius, once.gathered.radius)
 
 
+@pytest.mark.integration
 @every_cpu_backend
 @every_strategy
 def test_a_run_in_batches_learns_and_resumes_to_the_same_bits(tmp_path, backend, name):

@@ -248,6 +248,7 @@ def test_gaussians_are_added_in_the_cell_alone_and_validation_views_are_common(
     assert (jobs[0].cell.owned ^ jobs[1].cell.owned).all()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("asked", "said"), [
     ("3", "46 views are too few for 3 blocks"), ("many", "blocks is 'many'"),
     ("0", "blocks is '0'")])

@@ -91,6 +91,7 @@ def calibrated(tmp_path, *, seconds=100.0, clock=None, task=None):
         seconds=seconds)
 
 
+@pytest.mark.integration
 def test_what_every_step_takes_is_found_at_each_level_and_nothing_is_left_behind(tmp_path):
     clock = Ticks()
     found = calibrated(tmp_path, clock=clock)
@@ -110,6 +111,7 @@ def test_when_time_is_used_up_finer_levels_are_told_by_their_pixels(tmp_path):
     assert costs[REPORT].fixed == pytest.approx(0.004 / 3)
 
 
+@pytest.mark.integration
 def test_timing_changes_nothing_of_the_run(tmp_path):
     timed, plain = first_state(), first_state()
     task = tiny_task()
@@ -119,6 +121,7 @@ def test_timing_changes_nothing_of_the_run(tmp_path):
     assert same(timed, plain)
 
 
+@pytest.mark.integration
 def test_a_scene_without_validation_views_has_reports_that_cost_nothing(tmp_path):
     task = replace(tiny_task(RunConfig(iterations=60, max_gaussians=90)), validation=[])
     assert calibrated(tmp_path, task=task).costs[REPORT].seconds(0.09) == 0

@@ -89,6 +89,7 @@ def test_nothing_is_replaced_where_the_share_is_less_than_one():
     assert source.tolist() == list(range(8))
 
 
+@pytest.mark.integration
 def test_equal_scores_are_drawn_alike_and_the_draw_follows_the_weights():
     generator = seeded()
     counts = torch.zeros(4)

@@ -67,6 +67,7 @@ def run(state, task, until=60):
     return reports
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("flat")
 @pytest.mark.parametrize("config", [CONFIG, *STRATEGIES.values()])
 def test_the_steps_between_are_not_taken_and_the_final_phase_is(config):
@@ -87,6 +88,7 @@ def whole_run():
     return state
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("flat")
 @pytest.mark.parametrize("stop", [17, 37, 38, 50])
 def test_a_resumed_run_jumps_at_the_same_step_to_the_same_bits(tmp_path, stop):
@@ -99,6 +101,7 @@ def test_a_resumed_run_jumps_at_the_same_step_to_the_same_bits(tmp_path, stop):
     assert resumed.validation_history == whole.validation_history
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("flat")
 def test_it_can_be_switched_off():
     config = replace(CONFIG, early_stop=False)
@@ -107,6 +110,7 @@ def test_it_can_be_switched_off():
     assert (state.skipped_phase, state.steps) == (None, 60)
 
 
+@pytest.mark.integration
 def test_without_validation_views_a_run_takes_all_its_steps(monkeypatch):
     monkeypatch.setattr(fitting, "report_every", lambda _: 2)
     state, task = first_state(), replace(tiny_task(), validation=[])

@@ -144,6 +144,7 @@ def stepped(exposure, steps=300, images=4, seed=0):
     return truth
 
 
+@pytest.mark.integration
 def test_gains_are_found_up_to_their_mean():
     exposure = Exposure(4)
     truth = stepped(exposure, 3000)

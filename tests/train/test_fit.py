@@ -60,6 +60,7 @@ def whole_run(backend, device, config):
     return state
 
 
+@pytest.mark.integration
 @every_run
 @every_strategy
 def test_training_raises_the_psnr_of_a_view_that_it_never_sees(backend, device, config):
@@ -72,6 +73,7 @@ def test_training_raises_the_psnr_of_a_view_that_it_never_sees(backend, device, 
     assert reports[-1].gaussians == len(state.splats) <= 90
 
 
+@pytest.mark.integration
 @every_run
 def test_two_runs_with_one_seed_give_the_same_bits(backend, device):
     first, second = first_state(CONFIG, device, backend), first_state(CONFIG, device, backend)
@@ -80,6 +82,7 @@ def test_two_runs_with_one_seed_give_the_same_bits(backend, device):
     assert same(first, second)
 
 
+@pytest.mark.integration
 @every_strategy
 def test_any_number_of_threads_trains_to_the_same_bits(monkeypatch, config):
     states = []
@@ -104,6 +107,7 @@ def test_backends_walk_the_same_way():
         assert (value - other).norm() <= 2e-4 * moved, name
 
 
+@pytest.mark.integration
 def test_backends_walk_the_same_way_under_masks():
     states = {}
     for backend in ("torch", "numba"):
@@ -117,6 +121,7 @@ def test_backends_walk_the_same_way_under_masks():
         validation_psnr(states["numba"], masked_task("numba")), abs=1e-3)
 
 
+@pytest.mark.integration
 @every_run
 def test_a_masked_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(
     tmp_path, backend, device
@@ -146,6 +151,7 @@ def test_another_seed_gives_another_result():
     assert not same(first, second)
 
 
+@pytest.mark.integration
 @every_run
 @every_strategy
 @pytest.mark.parametrize("stop", [1, 17, 30])
@@ -166,6 +172,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_bits(
     assert bytes_of["whole"] == bytes_of["resumed"]
 
 
+@pytest.mark.integration
 @every_run
 @pytest.mark.parametrize(("degree", "colored"), [(0, 40), (1, 40), (2, 17), (3, 17), (3, 0)])
 def test_a_run_in_which_only_some_have_harmonics_resumes_to_the_same_bits(
@@ -188,6 +195,7 @@ def test_a_run_in_which_only_some_have_harmonics_resumes_to_the_same_bits(
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("first", "second"), [("torch", "numba"), ("numba", "torch")])
 def test_a_run_that_one_backend_began_goes_on_with_another(tmp_path, first, second):
     state = first_state(backend=first)
@@ -273,6 +281,7 @@ def test_a_loss_that_stays_not_finite_stops_the_run(backend):
         run(state, tiny_task(backend=backend), 30)
 
 
+@pytest.mark.integration
 @every_cpu_backend
 def test_one_step_whose_loss_is_not_finite_is_skipped_and_counted(backend, monkeypatch, tmp_path):
     state, task = first_state(backend=backend), tiny_task(backend=backend)

@@ -62,11 +62,13 @@ def plain():
     return candidate, psnr(trained(candidate), candidate.task.train)
 
 
+@pytest.mark.integration
 def test_points_all_on_one_plane_are_trained(plain):
     _, reached = plain
     assert reached > 25
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("factor", [1000.0, 0.1])
 def test_a_scene_in_other_units_is_trained_as_well(plain, factor):
     candidate, reached = plain
@@ -74,6 +76,7 @@ def test_a_scene_in_other_units_is_trained_as_well(plain, factor):
     assert psnr(trained(other), other.task.train) == pytest.approx(reached, abs=0.5)
 
 
+@pytest.mark.integration
 def test_views_all_at_one_place_are_trained():
     candidate = scene(views=12)
     one = candidate.task.train[0]
@@ -89,6 +92,7 @@ def test_cameras_in_one_place_have_an_extent():
     assert found.nearness == pytest.approx(3)
 
 
+@pytest.mark.integration
 def test_constant_images_become_their_colour():
     candidate = scene(views=8)
     views = [TrainView(view.camera, np.full_like(view.image, 90)) for view in candidate.task.train]
@@ -96,12 +100,14 @@ def test_constant_images_become_their_colour():
     assert psnr(state, views) > 20
 
 
+@pytest.mark.integration
 def test_black_images_do_no_harm():
     candidate = scene(views=8)
     views = [TrainView(view.camera, np.zeros_like(view.image)) for view in candidate.task.train]
     assert psnr(trained(candidate, train=views), views) > 20
 
 
+@pytest.mark.integration
 def test_a_gaussian_that_no_view_sees_stays_where_it_is():
     candidate = scene(views=8)
     hidden = np.array([[0.0, 0.0, -5.0]])  # behind all cameras
@@ -112,6 +118,7 @@ def test_a_gaussian_that_no_view_sees_stays_where_it_is():
     assert away.min() < 1e-3
 
 
+@pytest.mark.integration
 def test_a_thing_that_moves_leaves_the_rest_as_it_is():
     candidate = scene(views=12)
     views, still = [], np.ones((96, 128), bool)
@@ -124,6 +131,7 @@ def test_a_thing_that_moves_leaves_the_rest_as_it_is():
     assert reached > psnr(trained(candidate), candidate.task.train, still) - 2.5
 
 
+@pytest.mark.integration
 def test_jumps_of_the_exposure_are_taken_by_gains():
     candidate = scene(drift=0.15)
     truth = scene().task.train
@@ -135,6 +143,7 @@ def test_jumps_of_the_exposure_are_taken_by_gains():
     assert np.abs(gains.log_gains.mean(axis=0)).max() < 1e-9
 
 
+@pytest.mark.integration
 def test_nothing_of_the_scene_in_any_view_leaves_the_first_gaussians():
     candidate = scene(views=8)
     away = np.diag([-1.0, 1.0, -1.0, 1.0])  # all cameras turned round
@@ -144,6 +153,7 @@ def test_nothing_of_the_scene_in_any_view_leaves_the_first_gaussians():
     assert len(state.splats) == 1000
 
 
+@pytest.mark.integration
 def test_a_scene_of_few_views_is_examined_and_trained():
     needs = examine(scene(window=True, views=4))
     assert needs.config.background == "off"

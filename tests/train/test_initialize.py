@@ -92,6 +92,7 @@ def test_behind_all_gaussians_is_a_grey_backdrop_except_in_the_reference(densify
         assert np.linalg.norm(away) <= backdrop.reach
 
 
+@pytest.mark.integration
 def test_a_run_keeps_its_backdrop_from_one_checkpoint_to_the_next(tmp_path):
     task = tiny_task(replace(CONFIG, densify="budget"))
     state = first_state(task, GRID, GREY, most=100)

@@ -144,6 +144,7 @@ def relative(ours, theirs):
     return np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("ssim_weight", WEIGHTS)
 @pytest.mark.parametrize("size", SIZES)
 def test_the_fused_loss_and_gradient_equal_the_closed_form(size, ssim_weight):

@@ -88,6 +88,7 @@ def test_forgetting_touches_one_parameter_only():
 
 # ---- fused: gradients in buffers, one kernel for all parameters ----
 
+@pytest.mark.integration
 @pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize("n", [1, 5, 37])  # numbers of values that no vector divides
 def test_fused_steps_equal_those_of_torch(n, backend):

@@ -57,6 +57,7 @@ def test_the_defaults_of_a_run_are_those_of_the_normal_quality():
         QUALITIES["normal"].iterations, QUALITIES["normal"].max_size)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("minutes", [0.1, 1.0, 10.0])
 def test_minutes_are_filled_calibration_included(minutes):
     made = make_plan(TrainConfig(minutes=minutes), FACTS, COST)
@@ -125,6 +126,7 @@ def planned(tmp_path, monkeypatch, *, minutes, trials=0.0, surfaces=0.0, loading
     return TrainPlan.read(tmp_path), notices, clock.now
 
 
+@pytest.mark.integration
 def test_minutes_include_a_search_for_surfaces_that_only_the_longer_run_has_room_for(
         tmp_path, monkeypatch):
     likely = plan.probe_config(TrainConfig(minutes=5.0), Facts(16_000, 80, 9000, 10**9))
@@ -152,6 +154,7 @@ def test_trials_and_surfaces_take_a_fifth_of_the_minutes_and_steps_at_least_half
     assert read_config(tmp_path).stereo == ("off" if "surfaces" in slow else "on")
 
 
+@pytest.mark.integration
 def test_the_part_that_is_asked_for_is_searched_whatever_it_takes(tmp_path, monkeypatch):
     made, notices, before = planned(
         tmp_path, monkeypatch, minutes=1.0, surfaces=23.0, stereo="on")
@@ -161,12 +164,14 @@ def test_the_part_that_is_asked_for_is_searched_whatever_it_takes(tmp_path, monk
     assert notices == []
 
 
+@pytest.mark.integration
 def test_half_of_the_minutes_are_steps_even_where_loading_took_the_rest(tmp_path, monkeypatch):
     made, _, before = planned(tmp_path, monkeypatch, minutes=1.0, loading=50.0)
     assert before > 50
     assert made.seconds == pytest.approx(30, rel=0.02)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("minutes", "blurred"), [(0.05, True), (0.2, False)])
 def test_steps_under_a_sixth_of_a_normal_run_are_said_before_the_first(
         tmp_path, monkeypatch, minutes, blurred):
@@ -181,6 +186,7 @@ def test_a_hundredth_of_a_minute_gives_the_smallest_run():
     assert made.max_gaussians >= 5000
 
 
+@pytest.mark.integration
 def test_no_time_makes_a_run_endless():
     assert make_plan(TrainConfig(minutes=1e6), FACTS, COST).iterations == 100_000
 

@@ -32,6 +32,7 @@ def found_on(paint):
     return found(paint=paint)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("paint", [shading, grain])
 def test_they_lie_on_the_wall_one_in_a_cell(paint):
     surfaces = found_on(paint)
@@ -50,17 +51,20 @@ def test_they_have_the_colour_of_the_wall():
     assert np.median(np.abs(surfaces.colors[:, 0] - expected)) < 3
 
 
+@pytest.mark.integration
 def test_a_cell_with_a_sparse_point_gets_none():
     y, z = np.meshgrid(np.arange(-2.0, 2.0, 0.03), np.arange(-1.6, 1.6, 0.03))
     everywhere = np.stack([np.full_like(y, 3.01), y, z], -1).reshape(-1, 3)
     assert len(found(everywhere, grain).points) < 0.2 * len(found_on(grain).points)
 
 
+@pytest.mark.integration
 def test_without_tracks_points_in_the_image_tell_the_depth():
     nothing = [np.empty(0, np.int64)] * len(AROUND)
     assert found(tracks=nothing).points.tolist() == found_on(shading).points.tolist()
 
 
+@pytest.mark.integration
 def test_a_view_that_sees_few_points_is_left_out():
     *others, last = tracks_of(EDGE)
     rest = found(cameras=AROUND[:-1])
@@ -88,6 +92,7 @@ def test_what_one_view_finds_alone_does_not_count(monkeypatch):
     assert len(found().points) > 0
 
 
+@pytest.mark.integration
 def test_they_are_searched_once_and_only_when_asked_for():
     asked = []
     evidence = Evidence(views_of(AROUND, grain), EDGE, 1.0,

@@ -71,6 +71,7 @@ def near(ours, theirs, tolerance=GRADIENT_TOLERANCE):
     return error <= tolerance * max(theirs.norm(), 1e-12)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("mask", "gain"), [(None, None), (half(), GAIN)], ids=["plain", "both"])
 def test_a_step_leaves_loss_gradients_and_statistics(mask, gain):
     view = TrainView(CAMERA, photograph(), mask)
@@ -95,6 +96,7 @@ def depth():
     return SensorDepth(rays.astype(np.float32), z.astype(np.float32), 0.02, len(row))
 
 
+@pytest.mark.integration
 def test_a_step_with_sensor_depth_and_those_before_and_after_without_it():
     compute = gradient_step("triton", DEVICE)
     views = [TrainView(CAMERA, photograph(), half(), depth=one) for one in (None, depth(), None)]
@@ -110,6 +112,7 @@ def test_a_step_with_sensor_depth_and_those_before_and_after_without_it():
     assert exact(SEEN, views[1])[0] > exact(SEEN, views[0])[0] + 1e-4
 
 
+@pytest.mark.integration
 def test_a_step_on_a_backdrop_has_its_colour_and_one_after_it_is_on_black_again():
     view = TrainView(CAMERA, photograph())
     on_grey = replace(SEEN, backdrop=Backdrop(0.2, 0.9, 0.4, 0.0, 0.0, 0.0, 1.0))
@@ -124,6 +127,7 @@ def test_a_step_on_a_backdrop_has_its_colour_and_one_after_it_is_on_black_again(
             assert near(optimizer.gradient(name), leaf.grad), name
 
 
+@pytest.mark.integration
 def test_a_view_that_sees_nothing_has_a_loss_and_no_gradient():
     behind = SEEN.map(torch.clone)
     behind.means = behind.means - torch.tensor([0.0, 0.0, 50.0])
@@ -135,6 +139,7 @@ def test_a_view_that_sees_nothing_has_a_loss_and_no_gradient():
         assert not optimizer.gradient(name).any(), name
 
 
+@pytest.mark.integration
 def test_a_view_under_a_mask_that_hides_all_moves_nothing():
     view = TrainView(CAMERA, photograph(), np.zeros((HEIGHT, WIDTH), bool))
     optimizer, _, loss, _ = step(SEEN, view)

@@ -61,6 +61,7 @@ def test_values_are_composited_exactly_as_colours():
     np.testing.assert_allclose(paint(splats, view, list(values.T), "torch"), rgb, atol=1e-5)
 
 
+@pytest.mark.integration
 def test_holes_and_sides_that_no_view_shows_are_not_trusted():
     splats = dots(room(step=0.2), radius=0.12)
     eyes = [[0, y, 1.5] for y in (-0.5, 0.0, 0.5)]

@@ -51,6 +51,7 @@ def plain(tmp_path_factory):
     return inputs, (folder / "train" / "splats.ply").read_bytes()
 
 
+@pytest.mark.integration
 def test_a_callback_sees_every_step_and_changes_nothing(plain, tmp_path):
     inputs, expected = plain
     spy = Spy()

@@ -98,6 +98,7 @@ def test_a_port_that_is_taken_is_refused(room, capsys):
     assert f"the port {port} is in use" in capsys.readouterr().err.lower()
 
 
+@pytest.mark.integration
 def test_ctrl_c_ends_it_without_a_word_too_many_and_frees_the_port(room):
     with socket.create_server(("127.0.0.1", 0)) as free:  # other workers take the default
         port = free.getsockname()[1]

@@ -432,6 +432,7 @@ def test_a_manifest_that_is_a_link_to_nowhere_is_damaged_not_missing(workspace: 
     assert content(workspace) == "two"
 
 
+@pytest.mark.integration
 def test_only_leftovers_of_processes_that_are_gone_are_scraps(workspace: Workspace) -> None:
     workspace.root.mkdir()
     gone = subprocess.Popen([sys.executable, "-c", ""])
