@@ -8,10 +8,13 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from recon_cli import machine
-from recon_cli.pipeline.execute import Job
 from recon_cli.processes import start_module
+
+if TYPE_CHECKING:
+    from recon_cli.pipeline.execute import Job
 
 _SOURCES = Path(__file__).parents[1]
 _DRIVER = Path("/proc/driver/nvidia/version")  # of an NVIDIA GPU

@@ -23,8 +23,8 @@ from recon_cli.io.images import read_png
 from recon_cli.io.svg import PlanLayout, element, label
 from recon_cli.report.chart import TICK_STEPS, draw_legend, draw_mark
 from recon_cli.report.gallery import embed, encode_sheet, note_damage, read_picture
+from recon_cli.report.records import read_regions
 from recon_cli.report.stage_status import StageReports
-from recon_cli.report.trust_section import read_regions
 from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene, View, views_ahead
 from recon_cli.trust.poorly_seen import PoorlySeenRegion

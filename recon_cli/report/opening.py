@@ -13,8 +13,8 @@ from markupsafe import Markup
 from recon_cli.errors import FormatError
 from recon_cli.evaluation.scores import Metrics
 from recon_cli.report.gallery import ENCODINGS, read_picture
+from recon_cli.report.records import read_trust_record
 from recon_cli.report.stage_status import StageReport, StageReports
-from recon_cli.report.trust_section import read_record
 from recon_cli.splats.html import find_title
 from recon_cli.trust.quality import Quality, delivered_model, describe_quality, name_view
 from recon_cli.trust.scene_trust import TrustRecord
@@ -55,7 +55,7 @@ def build_opening(stages: StageReports, metrics: Metrics | None, page: Path) -> 
     except (FormatError, OSError):  # which the section on the capture says
         frames = ()
     try:
-        trust = read_record(stages)
+        trust = read_trust_record(stages)
     except FormatError:  # which the section on trust says
         trust = None
     picture, caption = _find_picture(stages, metrics, frames)

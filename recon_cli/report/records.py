@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from recon_cli.config.stages import MODEL_LABELS
 from recon_cli.errors import FormatError, ManifestError
@@ -23,11 +24,36 @@ from recon_cli.evaluation.scores import (
     or_dash,
     view_table,
 )
+from recon_cli.trust.poorly_seen import PoorlySeenRegion
+from recon_cli.trust.scene_trust import TrustRecord
 from recon_cli.workspace.summaries import LogRow
+
+if TYPE_CHECKING:
+    from recon_cli.report.stage_status import StageReports
 
 BASE, PRUNED = MODELS = ("base", "pruned")
 _TITLES = {"psnr": "PSNR", "psnr_8bit": "8-bit", "ssim": "SSIM", "ssim_padded": "SSIM 0-pad",
            "lpips": "LPIPS", "mask": "masks"}
+
+
+def read_trust_record(stages: StageReports) -> TrustRecord | None:
+    """Returns evaluate's record on trust; None without it. FormatError if it is damaged."""
+    stage = stages["evaluate"]
+    if not stage.there:
+        return None
+    try:
+        return TrustRecord.read(stage.folder)
+    except ManifestError as error:
+        raise FormatError(error.message) from error
+
+
+def read_regions(stages: StageReports) -> tuple[PoorlySeenRegion, ...]:
+    """Returns the poorly seen regions, for the plan; none where nothing can be read."""
+    try:
+        record = read_trust_record(stages)
+    except FormatError:  # which the section says
+        return ()
+    return record.poorly_seen if record else ()
 
 
 def read_metrics(folder: Path) -> Metrics:

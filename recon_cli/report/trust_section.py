@@ -8,16 +8,15 @@ from pathlib import Path
 from markupsafe import Markup
 
 from recon_cli.config.stages import MODEL_LABELS
-from recon_cli.errors import FormatError, ManifestError
+from recon_cli.errors import FormatError
 from recon_cli.evaluation.scores import Table
 from recon_cli.report.chart import Axis, Series, draw_chart
 from recon_cli.report.gallery import MOST_THUMBS, note_damage, read_picture
-from recon_cli.report.records import MODELS
+from recon_cli.report.records import MODELS, read_trust_record
 from recon_cli.report.stage_status import StageReports
 from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.trust.heat_map import INVENTED, TRUSTED, legend_stops
-from recon_cli.trust.poorly_seen import PoorlySeenRegion
-from recon_cli.trust.scene_trust import FOLDER, ModelTrust, TrustRecord
+from recon_cli.trust.scene_trust import FOLDER, ModelTrust
 from recon_cli.trust.surface import MIN_SPAN_DEG
 
 
@@ -36,30 +35,10 @@ class TrustSection:
     ends: tuple[float, float] = (TRUSTED, INVENTED)
 
 
-def read_record(stages: StageReports) -> TrustRecord | None:
-    """Returns evaluate's record on trust; None without it. FormatError if it is damaged."""
-    stage = stages["evaluate"]
-    if not stage.there:
-        return None
-    try:
-        return TrustRecord.read(stage.folder)
-    except ManifestError as error:
-        raise FormatError(error.message) from error
-
-
-def read_regions(stages: StageReports) -> tuple[PoorlySeenRegion, ...]:
-    """Returns the poorly seen regions, for the plan; none where nothing can be read."""
-    try:
-        record = read_record(stages)
-    except FormatError:  # which the section says
-        return ()
-    return record.poorly_seen if record else ()
-
-
 def read_trust(stages: StageReports) -> TrustSection:
     """Returns the section of a workspace, as far as its files can be read."""
     try:
-        record = read_record(stages)
+        record = read_trust_record(stages)
     except FormatError as error:
         return TrustSection(f"Trust is not shown: {error.message}")
     if record is None:

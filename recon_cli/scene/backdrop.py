@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.scene.similarity import Similarity
+if TYPE_CHECKING:
+    from recon_cli.scene.similarity import Similarity
 
 SPHERE_GAUSSIANS = 1024  # 6 degrees apart; more where they would be too large for a format
 SPHERE_OPACITY = 0.99  # the rasterizers clamp alpha there
