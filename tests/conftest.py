@@ -58,8 +58,9 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 @sys.addaudithook
-def _refuse_programs(event: str, _arguments: tuple[object, ...]) -> None:
-    if event == "subprocess.Popen" and _running and not any(
+def _refuse_programs(event: str, arguments: tuple[object, ...]) -> None:
+    # Python alone: `platform` asks `uname` once in each process, whichever test is the first
+    if event == "subprocess.Popen" and arguments[0] == sys.executable and _running and not any(
             map(_running[0].get_closest_marker, HEAVY)):
         pytest.fail("This test starts a program: mark it `integration`.")
 
