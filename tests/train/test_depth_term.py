@@ -117,7 +117,7 @@ def test_samples_fall_into_the_pixels_of_any_size_and_none_under_a_mask():
 def blank_wall(depth):
     """The task of a wall of one grey, which images alone do not place, and its Gaussians."""
     scene = wall_scene(config=replace(
-        WALL_CONFIG, depth=depth, iterations=200, background="off", stereo="off", exposure="off",
+        WALL_CONFIG, depth=depth, iterations=300, background="off", stereo="off", exposure="off",
         means_rate=3e-3))
     grey = [TrainView(view.camera, np.full_like(view.image, 128),
                       depth=sensor(view.camera, np.full(view.image.shape[:2], 2.0)))
@@ -133,7 +133,7 @@ def test_a_blank_wall_comes_to_where_the_sensor_sees_it():
     for depth in ("off", "on"):
         task, points, colors = blank_wall(depth)
         state = begin_at(task, points, colors, most=2000)
-        fit(state, task, 200)
+        fit(state, task, 300)
         surface = render_surface(state.splats, task.train[5].camera, backend="numba").depth
         off[depth] = float((surface[surface > 0] - 2.0).abs().median())
     assert off["off"] > 0.08
