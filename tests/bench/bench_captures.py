@@ -150,7 +150,7 @@ def blurred_video(data: Path, out: Path) -> Path:
 CAPTURES = {
     "fox": Capture(given("fox/images"), fox),
     "fox, noise 20": Capture(noisy_fox, fox, options={
-        "denoise": ("--force", "--filter", "bilateral"), "sfm": ("--pairs", "sequential")}),
+        "denoise": ("--force",), "sfm": ("--pairs", "sequential")}),
     "living": Capture(given("rooms/living/video.mp4"), room("living"), metric=True),
     "office": Capture(given("rooms/office/video.mp4"), room("office"), metric=True),
     "living, noisy": Capture(
