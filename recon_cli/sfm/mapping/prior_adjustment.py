@@ -22,6 +22,8 @@ Centers = Mapping[str, NDArray[np.float64]]  # [3] camera centres by name
 LEAST_ERROR_PX = 0.2
 # Stretches of a walk whose drifts do not depend on each other.
 INDEPENDENT = 3
+# Median length of a vector of three independent errors, in their standard deviations.
+_MEDIAN_LENGTH = 1.538
 
 
 def make_points(
@@ -107,4 +109,4 @@ def measure_deviation(model: pycolmap.Reconstruction, priors: Centers) -> float:
            for image in map(model.image, model.reg_image_ids()) if image.name in priors]
     if not off:
         return 0.0
-    return float(np.median(off) / 1.538 * max(1.0, len(off) / INDEPENDENT)**0.5)
+    return float(np.median(off) / _MEDIAN_LENGTH * max(1.0, len(off) / INDEPENDENT)**0.5)
