@@ -265,7 +265,7 @@ class TrainConfig(StageConfig):
         minimum=0.05, maximum=1.0, expert=True)
     compact_only: bool = option(
         False, "With pruning: end where it begins, as only the compact model is wanted.",
-        late=True)
+        late=True, expert=True)
     seed: int = option(0, "Random seed.", minimum=0)
     blocks: str = option(
         "auto", "Blocks to train: auto, N or off.", metavar="N")

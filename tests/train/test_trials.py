@@ -92,7 +92,7 @@ def test_what_the_options_say_is_not_tried():
 
 def test_too_few_views_switch_nothing_on():
     needs = examine(scene(window=True, drift=0.15, views=6))
-    assert needs.config.exposure == "off"
+    assert needs.config.exposure == needs.config.background == "off"
     assert "too few views" in reasons(needs)["exposure"]
 
 

@@ -24,6 +24,7 @@ from recon_cli.scene.splats import SH_C0, TERMS, Splats
 from recon_cli.scene.statistics import LEAST_WITNESSES
 from recon_cli.scene.train_view import TrainView
 from recon_cli.train.fit.task import Evidence
+from recon_cli.train.parts.decisions import split
 from recon_cli.train.parts.part import SEARCH_SIDE, Part, Sign, Start, TrialScene
 
 _RADIUS = 100.0  # x extent: from one end of the path to the other it moves by a degree
@@ -259,10 +260,10 @@ def _is_seen(scene: TrialScene) -> Sign:
     """Returns the sign: on in rooms, where full runs gain -.1 to 2.3 dB; around a thing, where all
     five lose up to .5 dB, a trial must show a gain (tests/bench/notes/training.md).
     """
-    found = scene.evidence.once(_find)
+    found, task = scene.evidence.once(_find), scene.task
     if found.share == 0:
         return Sign(on=False, reason="points cover all that the views see")
-    if look_at_one_thing(scene.task.train):
+    if look_at_one_thing(task.train) or split(len(task.train), len(task.validation)) is None:
         return Sign()
     return Sign(on=True, reason=f"no point lies in {100 * found.share:.0f}% of the directions")
 
