@@ -25,7 +25,7 @@ import psutil
 import workbench
 
 STAGES = ("ingest", "denoise", "sfm", "place", "train", "prune", "evaluate", "export")
-_LOOK = 0.1  # seconds from one look at a running command to the next
+_LOOK = 0.2  # seconds from one look at a running command to the next
 
 
 def tree_seconds(process: psutil.Process) -> float:

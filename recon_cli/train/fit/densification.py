@@ -113,10 +113,7 @@ class BudgetRule:
 
     target: int  # count that it aims at and never exceeds
     min_opacity: float  # below this a Gaussian is deleted
-    # all opacities, and the scales of what views saw, are multiplied by these first; what the views
-    # need comes back
-    decay: float
-    scale_decay: float = 1.0
+    decay: float  # all opacities are multiplied by this first; what the views need comes back
     replaced: float = 0.0  # share of those with a score, deleted from the least: others may split
 
 
@@ -131,7 +128,6 @@ def densify_budget(
     splats = decay_opacities(splats, rule.decay)
     alive = splats.opacities >= rule.min_opacity
     known = alive & (score > 0)  # no view showed the others: nothing is known of them
-    splats.log_scales = splats.log_scales + math.log(rule.scale_decay) * known[:, None]
     order = torch.argsort(torch.where(known, score, math.inf), stable=True)
     alive[order[:int(rule.replaced * int(known.sum()))]] = False
     room = rule.target - int(alive.sum())
@@ -225,7 +221,7 @@ def _budget(state: TrainState, task: Task) -> None:
     if schedule.densifies(state.iteration):
         rule = BudgetRule(
             schedule.target(state.iteration, state.first_count), schedule.config.min_opacity,
-            schedule.recipe.opacity_decay, schedule.recipe.scale_decay, schedule.replaced)
+            schedule.recipe.opacity_decay, schedule.replaced)
         replace_splats(state, *densify_budget(
             state.splats, state.gathered.variance * task.inside(state.splats.means), rule,
             state.generator))

@@ -50,7 +50,6 @@ class Recipe:
     sh_at: tuple[float, float, float]  # shares at which the degree of the colours rises by one
     sh_every: int  # the higher degrees are moved every so many steps
     opacity_decay: float  # opacities are multiplied by this at each densification
-    scale_decay: float  # so are scales: what is not needed ends up in fewer tiles
     resets: bool  # opacities are lowered to .01 now and then, as in the reference
     # Gaussians of the least error that make room for others, of all: at one densification at most,
     # and in the course of a run. The one alone would replace all of them in a long one.
@@ -75,12 +74,10 @@ class Recipe:
 REFERENCE = Recipe(
     densify_from=500 / 30_000, densify_until=0.5, full_at=0.5, levels=(),
     sh_at=(1000 / 30_000, 2000 / 30_000, 3000 / 30_000), sh_every=1, opacity_decay=1.0,
-    scale_decay=1.0,
     resets=True, replaced_at_once=0.0, replaced=0.0, means_unit="extent")
 BUDGET = Recipe(
     densify_from=0.03, densify_until=0.6, full_at=0.54, levels=((0.4, 2),),
-    sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99,
-    scale_decay=0.9, resets=False,
+    sh_at=(0.15, 0.3, 0.45), sh_every=4, opacity_decay=0.99, resets=False,
     replaced_at_once=0.03, replaced=0.4, means_unit="nearness", means_rate=7.0,
     means_restart_rate=0.7, scales_rate=4.0, sh_rate=2.0, sh_rest_rate=4.0, momentum=0.8,
     final_from=0.8, final_rate=0.1,
