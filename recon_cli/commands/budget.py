@@ -84,11 +84,14 @@ def run_within(
     _report_frames(workspace, budget, call.deadline.seconds, estimator)
     stages("denoise", "sfm", "place", frames=frames)
     if budget.train_minutes is None:
-        pruning = left() * _PRUNE / (1 + _PRUNE)
-        prune = with_prune and pruning >= _LEAST_PRUNING * estimator.slowness
+        # pruning takes the place of the steps that are left out, where only its result is wanted
+        compact = with_prune and bool(given.get("train", {}).get("compact_only"))
+        pruning = 0.0 if compact else left() * _PRUNE / (1 + _PRUNE)
+        prune = compact or (with_prune and pruning >= _LEAST_PRUNING * estimator.slowness)
         seconds = max(left() - pruning * prune, _LEAST_TRAINING * estimator.slowness)
         budget = dataclasses.replace(
-            budget, train_minutes=round(seconds / 60, 2), prune=None if prune else False)
+            budget, train_minutes=round(seconds / 60, 2),
+            prune=True if compact else None if prune else False)
         write_json(workspace.root / FILE, budget.to_json())
     training: Settings = {"train": {"minutes": budget.train_minutes}}
     stages("train", frames=frames, training=training)

@@ -298,8 +298,8 @@ def config_options(
 ) -> Decorator:
     """Returns a decorator that adds an option for each field of a config.
 
-    `only` and `without` select fields by name, `expert` names those for experts in this verb, and
-    `lead` is put before each help.
+    `only` and `without` select fields by name, `expert` names those for experts in this verb beside
+    those that always are, unless `only` names them; `lead` is put before each help.
     """
     decorators: list[Decorator] = []
     for item in dataclasses.fields(config):
@@ -310,7 +310,7 @@ def config_options(
             _flag(config, item.name, choice, text) for choice, text in info.flags.items()
         ] or [_field(
             config, item.name, f"{lead}{info.help}  [{describe_default(item)}]",
-            expert=info.expert or item.name in expert)]
+            expert=(info.expert and not only) or item.name in expert)]
     return stack(decorators)
 
 

@@ -164,10 +164,10 @@ def _(prune: PruneSummary) -> str:
 
 @describe.register
 def _(scores: EvaluateSummary) -> str:
-    models = [f"{scores.base_psnr_db:.2f} dB (SSIM {scores.base_ssim:.3f})"]
-    if scores.pruned_psnr_db is not None and scores.pruned_ssim is not None:
-        models.append(f"the compact model {scores.pruned_psnr_db:.2f} dB "
-                      f"(SSIM {scores.pruned_ssim:.3f})")
+    found = (("", scores.base_psnr_db, scores.base_ssim),
+             ("the compact model ", scores.pruned_psnr_db, scores.pruned_ssim))
+    models = [f"{model}{psnr:.2f} dB (SSIM {ssim:.3f})"
+              for model, psnr, ssim in found if psnr is not None and ssim is not None]
     missing = len(scores.unregistered_test)
     return _join([
         f"{', '.join(models)} on {format_count(scores.test_views, 'held-out view')}",

@@ -85,6 +85,7 @@ def train(call: Call, with_prune: bool, with_view: bool) -> None:
     """Fit Gaussians; denoise and sfm run first where needed."""
     for name in call.settings.get("prune", {}) if not with_prune else ():
         raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
+    _check_compact(call, with_prune)
     with show_training(call) if with_view and not call.print_config else nullcontext() as live:
         callbacks = () if live is None else (live,)
         if with_prune:
@@ -176,7 +177,7 @@ def export(call: Call) -> None:
     help="Time for the whole run; frames, steps and pruning are chosen for it.  "
          "[minutes; default: no limit]")
 @options.config_options(IngestConfig, only=("frames",))
-@options.config_options(TrainConfig, only=("quality",))
+@options.config_options(TrainConfig, only=("quality", "compact_only"))
 @options.config_options(ExportConfig, only=("format", "title"))
 @click.option(
     "--open", "with_open", is_flag=True,
@@ -195,6 +196,7 @@ def run(
     INPUT is as for `recon ingest`. Without it, the previous input is used. The results are the
     scene (.ply), a page to look around in it (.html), and a report.
     """
+    _check_compact(call, with_prune)
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
     if minutes is not None and not call.print_config:
         from recon_cli.commands.budget import run_within  # imports OpenCV
@@ -217,6 +219,11 @@ def demo(call: Call) -> None:
     stages = [row.name for row in STAGES]
     run_stages(call, "demo", stages, sources=(SAMPLE,), base=_with_page(DEMO, call))
     end_run(open_job(call))
+
+
+def _check_compact(call: Call, with_prune: bool) -> None:
+    if call.settings.get("train", {}).get("compact_only") and not with_prune:
+        raise click.UsageError("--compact-only needs pruning: give --prune.")
 
 
 def _with_page(base: Settings, call: Call) -> Settings:

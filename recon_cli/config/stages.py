@@ -263,6 +263,9 @@ class TrainConfig(StageConfig):
     mid: float = option(
         0.6, "Point of the run whose state is kept for pruning midway.", unit="share",
         minimum=0.05, maximum=1.0, expert=True)
+    compact_only: bool = option(
+        False, "With pruning: end where it begins, as only the compact model is wanted.",
+        late=True, expert=True)
     seed: int = option(0, "Random seed.", minimum=0)
     blocks: str = option(
         "auto", "Blocks to train: auto, N or off.", metavar="N")

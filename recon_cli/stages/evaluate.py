@@ -243,6 +243,8 @@ def _load(config: EvaluateConfig, inputs: StageInputs, out: Path, ctx: StageCont
             evenly_spread(split, _SEEN_VIEWS), size, threads=ctx.threads))}
     folders = {model: inputs.folders[stage] for model, stage in _STAGES.items()
                if stage in inputs.folders}
+    if trained.config.compact_only and len(folders) > 1:
+        del folders["base"]  # its training ended where pruning began
     followed = trained.import_record is None and size == trained.config.max_size
     return _Evaluation(
         out, trained, folders, {model: read_falloffs(folder) for model, folder in folders.items()},

@@ -37,10 +37,11 @@ def fit_scene(
     if model is not None and not (out / CHECKPOINT).exists():
         model.write_inherited_files(task.schedule, out, ctx)
     state = first_or_saved(task, scene, out / CHECKPOINT, model)
-    until = task.schedule.config.iterations
+    plan = task.schedule
+    until = plan.mid if plan.config.compact_only else plan.config.iterations
     run_fit(state, task, until, RunSegment(
-        out, "train", until, first=task.schedule.first,
-        keep={task.schedule.mid: "mid.safetensors"}), ctx)
+        out, "train", until, first=plan.first,
+        keep={plan.mid: "mid.safetensors"}), ctx)
     save_state(out / "final.safetensors", state)
     write_ply(out / "splats.ply", state.splats)
     write_photometry(out, state.photometry)

@@ -403,14 +403,14 @@ class PruneSummary(JsonRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateSummary(JsonRecord):
-    """Mean scores on the held-out views; those of the pruned model only where there is one."""
+    """Mean scores on the held-out views, of the models that there are."""
 
     test_views: int
     unregistered_test: tuple[str, ...]  # names of held-out views without a camera
     masked_out_test: tuple[str, ...] | None = None  # of those whose masks leave too little
-    base_psnr_db: float
-    base_ssim: float
-    base_gaussians: int
+    base_psnr_db: float | None = None  # None where only the compact model was wanted
+    base_ssim: float | None = None
+    base_gaussians: int | None = None
     pruned_psnr_db: float | None = None
     pruned_ssim: float | None = None
     pruned_gaussians: int | None = None

@@ -129,6 +129,14 @@ def test_train_prune_branches_off_in_the_middle() -> None:
     assert (prune["at"], prune["ratio"]) == ("mid", 0.25)
 
 
+def test_the_compact_model_alone_needs_pruning(capsys: Said) -> None:
+    assert main(["run", "room.mp4", "--compact-only", "--no-prune"]) == 2
+    assert main(["train", "--compact-only"]) == 2
+    assert_facts(capsys.readouterr().err, "--compact-only", "--prune")
+    assert main(["run", "room.mp4", "--compact-only"]) == 0
+    assert config_of("train")["compact_only"] is True
+
+
 def test_pruning_options_without_prune_are_a_usage_error(capsys: Said) -> None:
     assert main(["train", "--ratio", "0.25"]) == 2
     assert_facts(capsys.readouterr().err, "--ratio", "--prune")

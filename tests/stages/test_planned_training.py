@@ -11,11 +11,12 @@ from facts import assert_facts, raises
 from killed import Killed, kill_after
 from tiny_scene import Shape, make_inputs
 
-from recon_cli.config.stages import PruneConfig, TrainConfig
+from recon_cli.config.stages import EvaluateConfig, PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
 from recon_cli.errors import TrainingError
+from recon_cli.evaluation.scores import Metrics
 from recon_cli.splats.ply import read_ply
-from recon_cli.stages import prune, train
+from recon_cli.stages import evaluate, prune, train
 from recon_cli.train import plan as planning
 from recon_cli.train.fit import loop, train_data
 from recon_cli.train.fit.train_data import estimate_memory
@@ -217,3 +218,22 @@ def test_pruning_takes_every_step_where_training_did(inputs, tmp_path):
     both = StageInputs({**inputs.folders, "train": tmp_path / "train"})
     assert prune.run(
         PruneConfig(at="mid"), both, tmp_path / "prune", CONTEXT).iterations == 160
+
+
+def test_whoever_wants_the_compact_model_alone_gets_the_same_one(inputs, tmp_path):
+    asked = replace(STOPPING, early_stop=False)
+    for name, config in (("both", asked), ("alone", replace(asked, compact_only=True))):
+        summary = run(config, inputs, tmp_path / name)
+        assert summary.iterations == (96 if config.compact_only else 160)
+        given = StageInputs({**inputs.folders, "train": tmp_path / name})
+        (tmp_path / f"{name}-prune").mkdir()
+        pruned = prune.run(PruneConfig(at="mid"), given, tmp_path / f"{name}-prune", CONTEXT)
+        assert pruned.iterations == 160
+    assert (tmp_path / "both-prune" / "splats.ply").read_bytes() == (
+        tmp_path / "alone-prune" / "splats.ply").read_bytes()
+    given = StageInputs({**given.folders, "prune": tmp_path / "alone-prune"})
+    (tmp_path / "scores").mkdir()
+    scores = evaluate.run(EvaluateConfig(trust=False), given, tmp_path / "scores", CONTEXT)
+    assert scores.base_psnr_db is None
+    assert scores.pruned_psnr_db > 0
+    assert set(Metrics.read(tmp_path / "scores").models) == {"pruned"}

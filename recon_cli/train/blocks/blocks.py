@@ -186,7 +186,8 @@ def cut_blocks(
             frozenset(name for name, here in zip(names, chosen, strict=True) if here),
             frozenset(view.name for view in scene.validation),
             Cell(points, point_labels == index),
-            dataclasses.replace(config, blocks="off", jobs=None, on="local")))
+            dataclasses.replace(
+                config, blocks="off", jobs=None, on="local", compact_only=False)))
         jobs[-1].write()
     return tuple(jobs)
 

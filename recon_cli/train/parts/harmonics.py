@@ -19,20 +19,22 @@ _RULE = Rule(errors=0)
 
 
 def _choose_degree(trials: Trials, config: RunConfig) -> int:
+    """Returns the highest degree if it beats the first, else the first if that beats none."""
     if trials.split is None:
         return config.sh_degree
-    for low in (0, 1):
+    high = config.sh_degree
+    for low in (1, 0):
         name = f"harmonics above degree {low}"
         try:
-            decision = trials.compare(name, replace(config, sh_degree=low), config, _RULE)
+            decision = trials.compare(
+                name, replace(config, sh_degree=low), replace(config, sh_degree=high), _RULE)
         except OutOfTime:
             decision = skip_trial(name, NO_TIME, on=True)
         trials.decisions.append(decision)
-        if not decision.on:
-            return low
-        if decision.reason == NO_TIME:
+        if decision.on:
             break
-    return config.sh_degree
+        high = low
+    return high
 
 
 PART = Part("sh_degree", lambda _: Sign(), is_open=lambda scene: scene.harmonics,

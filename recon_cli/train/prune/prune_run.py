@@ -99,6 +99,8 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
             "training is not known.", hint="Prune it with --at end.")
     if import_record and import_record.doubt:
         ctx.notice(import_record.doubt)
+    if model.config.compact_only:  # its training ended in the middle
+        config = dataclasses.replace(config, at="mid")
     if config.at == "mid" and not single:
         ctx.notice("The blocks that the scene was trained in have no common middle: the finished "
                    "model is pruned.")
@@ -120,7 +122,8 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
         if config.at == "mid":
             # as many as the unpruned run took, which may have stopped early; where it continued for
             # a few steps only, too few to recover
-            rest = restore_state(final, task).steps - start.steps
+            rest = (model.config.iterations - start.iteration if model.config.compact_only
+                    else restore_state(final, task).steps - start.steps)
             continued = model.plan is not None and model.plan.continues_at is not None
             steps = max(rest, steps) if continued else rest
     return PruneSource(
