@@ -95,7 +95,7 @@ def test_a_machine_that_cannot_run_a_command_is_refused(monkeypatch, answer, err
         return found
 
     monkeypatch.setattr(ray_executor.ray, "get", get)
-    with pytest.raises(error, match=said):
+    with raises(error, "10.0.0.2", *facts):
         _check_node("10.0.0.2", answer, Path("/shared/out"))
 
 

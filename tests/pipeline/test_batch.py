@@ -177,7 +177,7 @@ def test_a_workspace_of_another_capture_is_left_alone(tmp_path, capsys):
     make_replica(tmp_path / "b" / "room", frames=6, tests=0)
     assert recon("ingest", tmp_path / "a" / "room", "-w", tmp_path / "out" / "room") == 0
     assert recon("batch", tmp_path / "b" / "room", "--out", tmp_path / "out") == 2
-    assert "holds a scene of" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "error:", tmp_path / "out" / "room")
 
 
 def test_two_batches_do_not_share_a_folder(tmp_path, capsys):

@@ -6,7 +6,6 @@ import threading
 
 import fake_stages
 import pytest
-from facts import raises
 from fake_stages import TABLE, bring, job_at
 
 from recon_cli.config.stages import ComputeConfig
@@ -76,7 +75,7 @@ def test_the_error_of_a_stage_names_photos_by_their_own_files(tmp_path, monkeypa
         raise SfmError("000000.png is blurred.", hint="Take 000000.png anew.")
 
     monkeypatch.setitem(fake_stages.actions, "denoise", fail)
-    with raises(SfmError) as caught:
+    with pytest.raises(SfmError) as caught:
         bring(job, "denoise")
     assert (caught.value.message, caught.value.hint) == ("28.jpg is blurred.", "Take 28.jpg anew.")
 

@@ -296,7 +296,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, splats, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with raises(OSError, 28):
         write_ply(path, splats.select(torch.arange(3)))
     assert path.read_bytes() == before
     assert [item.name for item in tmp_path.iterdir()] == ["a.ply"]

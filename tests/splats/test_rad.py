@@ -250,13 +250,13 @@ def test_spark_finds_every_gaussian_of_a_written_file(page: WatchedPage, tmp_pat
 
 
 @pytest.mark.parametrize(("change", "said"), [
-    ({"means": float("nan")}, "not finite"), ({"sh_dc": 1e6}, "float16")])
+    ({"means": float("nan")}, "finite"), ({"sh_dc": 1e6}, "float16")])
 def test_what_cannot_be_written_is_refused_and_leaves_no_file(
     change: dict[str, float], said: str, tmp_path: Path
 ) -> None:
     splats = archive_splats.room(20, degree=0)
     for name, value in change.items():
         getattr(splats, name)[3] = value
-    with pytest.raises(FormatError, match=said):
+    with raises(FormatError, said):
         write_rad(tmp_path / "room.rad", splats)
     assert not list(tmp_path.iterdir())
