@@ -227,7 +227,7 @@ BAD = {
 
 @pytest.mark.parametrize("reason", BAD)
 def test_a_matrix_that_is_no_similarity_stops_the_export_before_it_writes(inputs, reason):
-    with pytest.raises(ConfigError, match=reason.strip()) as caught:
+    with raises(ConfigError, reason.strip()) as caught:
         exported(inputs, transform=tuple(BAD[reason].ravel().tolist()))
     assert_facts(caught.value.hint, "rotation", "times")
     assert list((inputs.folders["train"].parent / "out").iterdir()) == []

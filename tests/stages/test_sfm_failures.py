@@ -144,18 +144,17 @@ def told(caplog, **changes):
 
 def test_the_stretches_that_are_left_out_are_told_with_their_times(caplog):
     text = told(caplog, left_out=("20.png", "21.png", "22.png", "30.png"))
-    assert_facts(text, "rest of the model", "4 frames", "20.png to 22.png (6.5 to 7.5 s)",
-                 "30.png (12.0 s)")
+    assert_facts(text, "model", 4, "20.png", "22.png", "6.5", "7.5 s", "30.png", "12.0 s")
 
 
 def test_models_that_are_left_aside_are_told(caplog):
     text = told(caplog, models=(49, 3), apart=(("5.png", "6.png", "7.png"),))
-    assert_facts(text, "disconnected models", 3, "frames", "22.5", "6.png to 7.png")
+    assert_facts(text, "disconnected", 3, "frames", "22.5", "6.png", "7.png")
 
 
 def test_frames_without_a_camera_are_told(caplog):
     text = told(caplog, unregistered_held_out=("3.png",))
-    assert_facts(text, "without a camera", "11 of 60 frames", "0.png to 10.png (0.0 to 1.0 s)")
+    assert_facts(text, "camera", "11 of 60", "0.png", "10.png", "0.0", "1.0 s")
     assert_facts(text, 1, "Held-out", "3.png")
 
 
