@@ -43,7 +43,7 @@ def test_poses_of_a_data_set_are_neither_praised_nor_blamed():
     verdict = judge_poses(
         sfm(verdict=None, poses={"use": "keep", "metric": True}, lines=["100% agree."]))
     assert verdict.level == "unknown"
-    assert_facts(verdict.text, "9 of 12", "data set")
+    assert_facts(verdict.text, "9 of 12", "data")
     assert verdict.lines == ("100% agree.",)
 
 

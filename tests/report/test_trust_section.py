@@ -41,7 +41,7 @@ def test_poorly_seen_regions_are_listed_escaped_and_drawn_in_the_plan(workspace)
     shown = section(page, "trust")
     assert "&lt;b&gt;000001" in shown
     assert "<b>000001" not in page
-    assert_facts(shown, "1 scene units")
+    assert_facts(shown, 1, "units")
     assert 'class="next"' in section(page, "capture")
     change(workspace, poorly_seen=[REGION.to_json()], metres=True)
     assert "1 m across" in section(page_of(workspace), "trust")

@@ -213,7 +213,7 @@ def test_the_same_model_gets_the_same_verdict_twice(tmp_path):
 
 @pytest.mark.integration
 def test_the_text_says_first_whether_the_model_can_be_trusted(tmp_path):
-    assert_facts(verdict_on(walk(), tmp_path).lines()[0], "16 of 16", "is trusted")
+    assert_facts(verdict_on(walk(), tmp_path).lines()[0], "16 of 16", "trusted")
     (tmp_path / "database.db").unlink()
     lines = verdict_on(broken_walk(), tmp_path).lines()
     assert_facts(lines[0], "not", "trusted")

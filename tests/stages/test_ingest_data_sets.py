@@ -270,7 +270,7 @@ def test_depth_that_fits_in_no_unit_gives_neither_points_nor_metres(
     summary = take(folder, tmp_path / "out")
     assert not summary.metric
     assert summary.points is None
-    assert_facts("\n".join(notices()), "depth", "not used", "25 times")
+    assert_facts("\n".join(notices()), "depth", "not", 25)
 
 
 def test_depth_that_nothing_shows_leaves_the_unit_open(tmp_path, notices):

@@ -226,7 +226,7 @@ def test_a_full_disk_leaves_no_half_written_frame(video, tmp_path, monkeypatch, 
         flush(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with raises(OSError, errno.ENOSPC):
         take(source, tmp_path / "out")
     left = sorted((tmp_path / "out" / "frames").iterdir())
     assert 0 < len(left) <= 3

@@ -38,8 +38,7 @@ def test_mixed_sizes_become_groups_and_are_told(tmp_path, notices):
     assert [(g["name"], g["width"], g["height"]) for g in written["groups"]] == [
         ("room: 128x96", 64, 48), ("room: 96x128", 48, 64)]
     assert [frame["group"] for frame in written["frames"]] == [0, 1, 0, 0, 1]
-    assert notices()[0] == (
-        "The photos form 2 groups with separate intrinsics: 3 of 128x96, 2 of 96x128.")
+    assert_facts(notices()[0], 2, "3 of 128x96", "2 of 96x128")
     assert len(notices()) == 3  # each size is reduced
 
 

@@ -191,10 +191,8 @@ def test_every_further_way_to_a_model_is_told_with_its_reason(caplog):
         attempt("relaxed", reason="only 40 of 60 frames got a camera", registered=49, kept=True),
         attempt("global", reason="the capture fell into 2 models",
                 skipped="it would take about 9 minutes")))
-    assert_facts(
-        text, "relaxed", "only 40 of 60 frames got a camera", "registered 49 frames", "is used")
-    assert_facts(text, "global was not tried", "the capture fell into 2 models",
-                 "it would take about 9 minutes")
+    assert_facts(text, "relaxed", "40 of 60", 49)
+    assert_facts(text, "global", 2, 9, "minutes")
     assert "exhaustive" not in text
 
 
@@ -210,7 +208,7 @@ def test_paths_are_resolved_before_the_process_leaves_the_folder(tmp_path, monke
 def test_a_problem_of_the_model_before_goes_on_within_the_sentence():
     broken = attempt("global", reason="The model is broken.", registered=9)
     line, = place._attempts(SimpleNamespace(attempts=[attempt("exhaustive"), broken]))
-    assert_facts(line, "global", "the model is broken", "9 frames")
+    assert_facts(line, "global", "broken", 9)
     assert ".:" not in line
 
 

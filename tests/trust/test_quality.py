@@ -78,7 +78,7 @@ def test_what_is_short_of_good_is_said(scores, well, sfm, word, why):
 def test_without_trust_or_cameras_of_recon_that_is_said_and_the_word_rests_on_the_views():
     found = describe_quality(metrics(31.0, name="base"), None, None)
     assert found.word == "good"
-    assert_facts(found.reason, "not measured")
+    assert_facts(found.reason, "not", "measured")
 
 
 def test_without_a_scored_view_nothing_is_claimed(tmp_path):
