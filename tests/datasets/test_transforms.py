@@ -74,36 +74,6 @@ def test_an_angle_of_view_and_the_size_of_the_image_make_a_lens(tmp_path):
     assert lens.params == pytest.approx((16.0, 16.0, 16.0, 12.0))
 
 
-@pytest.mark.parametrize(("more", "facts"), [
-    ({"fl_x": None, "fl_y": None}, ["focal"]), ({"fl_x": "wide"}, ["fl_x", "'wide'"]),
-    ({"fl_x": float("nan")}, ["fl_x", "nan"]), ({"fl_x": -3}, ["camera"]),
-    ({"fl_x": 10**400}, ["finite"]),
-    ({"fl_x": True}, ["fl_x", True]),
-    ({"camera_model": "EQUIRECTANGULAR"}, ["EQUIRECTANGULAR"]),
-    ({"k1": float("inf")}, ["k1", "inf"]), ({"k4": 0.1}, ["k4", 0.1]),
-    ({"fl_x": None, "fl_y": None, "camera_angle_x": 4.0}, ["camera_angle_x", "pi"]),
-    ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, ["tangential"])])
-def test_intrinsics_that_are_none_are_refused(tmp_path, more, facts):
-    with raises(FormatError, *facts):
-        read(tmp_path, posed_sets.transforms(**more))
-
-
-@pytest.mark.parametrize(("matrix", "fact"), [
-    (np.full((4, 4), np.nan).tolist(), "finite"),
-    ((2 * posed_sets.pose(2) @ posed_sets.OPENGL).tolist(), "rigid"),
-    ([[1, 0], [0, 1]], 4), ([], 0), ("x", "matrix")])
-def test_a_frame_whose_pose_is_none_is_named(tmp_path, matrix, fact):
-    with raises(FormatError, "images/0002.png", fact):
-        read(tmp_path, edited(transform_matrix=matrix))
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"frames": []}', '{"frames": 3}', "null"])
-def test_a_file_without_frames_is_refused(tmp_path, text):
-    (tmp_path / "transforms.json").write_text(text)
-    with raises(FormatError, "transforms.json"):
-        read_transforms(tmp_path)
-
-
 def test_images_that_are_gone_are_missing_and_need_no_lens(tmp_path):
     posed_sets.make_transforms(tmp_path)
     (tmp_path / "images" / "0001.png").unlink()
