@@ -81,7 +81,7 @@ def test_json_keeps_every_bit():
     {"translation": np.array([0.0, np.inf, 0.0])}, {"translation": np.zeros(4)},
 ])
 def test_what_is_no_similarity_is_refused(wrong):
-    with pytest.raises(ValueError):  # noqa: PT011
+    with raises(ValueError, *wrong):
         Similarity(**wrong)
 
 
