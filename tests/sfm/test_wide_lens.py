@@ -67,7 +67,7 @@ def samples(lens):
 
 @pytest.mark.integration
 def test_a_fisheye_is_found_with_about_its_focal_length():
-    focal = wide_lens._find_focal(GROUP, samples(FISHEYE), seed=0, threads=2)
+    focal = wide_lens._find_focal(GROUP, samples(FISHEYE), seed=0)
     assert focal == pytest.approx(360, rel=0.12)  # steps are a fifth
 
 
@@ -75,14 +75,14 @@ def test_a_fisheye_is_found_with_about_its_focal_length():
 @pytest.mark.parametrize("lens", [
     WIDE, ("SIMPLE_PINHOLE", (900.0, 512.0, 384.0)), ("SIMPLE_PINHOLE", (480.0, 512.0, 384.0))])
 def test_an_ordinary_lens_is_none(lens):
-    assert wide_lens._find_focal(GROUP, samples(lens), seed=0, threads=2) is None
+    assert wide_lens._find_focal(GROUP, samples(lens), seed=0) is None
 
 
 def test_few_matches_decide_nothing_unless_the_lens_is_named():
     few = [(ours[:10], theirs[:10]) for ours, theirs in samples(FISHEYE)]
-    assert wide_lens._find_focal(GROUP, few, seed=0, threads=2) is None
+    assert wide_lens._find_focal(GROUP, few, seed=0) is None
     named = dataclasses.replace(GROUP, model="RADIAL_FISHEYE")
-    assert wide_lens._find_focal(named, few, seed=0, threads=2) is not None
+    assert wide_lens._find_focal(named, few, seed=0) is not None
     assert wide_lens._camera(named, wide_lens.FISHEYE, 300.0).model_name == "RADIAL_FISHEYE"
 
 
