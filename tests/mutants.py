@@ -110,7 +110,7 @@ MUTANTS = (
     Mutant("blurriest-frame", "capture/frame_selection.py",
            "near[np.argmax(sharpness[near])]", "near[np.argmin(sharpness[near])]"),
     Mutant("noise-quartile", "capture/noise.py",
-           "np.abs(present))) / NORMAL_QUARTILE", "np.abs(present))) * NORMAL_QUARTILE"),
+           "np.float32) / NORMAL_QUARTILE", "np.float32) * NORMAL_QUARTILE"),
     Mutant("film-diagonal", "capture/exif.py",
            "math.hypot(width, height) * film", "max(width, height) * film"),
     Mutant("denoise-at-threshold", "stages/denoise.py",

@@ -9,6 +9,7 @@ COLMAP's, takes as long and loses 2.5% of them.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -299,7 +300,7 @@ def _write_geometries(
                 first, second = pair
                 matches = (match_descriptors(rows[first], rows[second]) if known is None
                            else known[pair])
-                return matches, pycolmap.estimate_two_view_geometry(
+                return matches, _estimate_geometry(
                     cameras[images[first].camera_id], places[first],
                     cameras[images[second].camera_id], places[second], matches, options)
 
@@ -312,6 +313,28 @@ def _write_geometries(
                         opened.write_matches(*ids, matches)
                     opened.write_two_view_geometry(*ids, geometry)
                 done(count)
+
+
+def _estimate_geometry(
+    ours: pycolmap.Camera, first: NDArray[np.float64],  # [K, 2] pixels
+    theirs: pycolmap.Camera, second: NDArray[np.float64],  # [L, 2] pixels
+    matches: Matches, options: pycolmap.TwoViewGeometryOptions,
+) -> pycolmap.TwoViewGeometry:
+    """Returns the verified matches of two images.
+
+    Of two images of one camera COLMAP estimates the focal length, too, unless it is known, in four
+    times the time of a fundamental matrix. That leaves no more wrong matches, except where one
+    plane explains nearly all and so does not determine it: there cameras of a room came out 1.7
+    times as far off.
+    """
+    other = copy.copy(theirs)
+    if ours.camera_id == theirs.camera_id and not ours.has_prior_focal_length:
+        other.camera_id += 1
+    geometry = pycolmap.estimate_two_view_geometry(ours, first, other, second, matches, options)
+    flat = geometry.config == int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC)
+    if flat and other.camera_id != theirs.camera_id:
+        return pycolmap.estimate_two_view_geometry(ours, first, theirs, second, matches, options)
+    return geometry
 
 
 def _verification_options(job: MappingJob) -> pycolmap.TwoViewGeometryOptions:
