@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -259,6 +260,20 @@ def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:
     _prepare_kernels(progress, backend)
     most = None if compute.max_memory is None else int(compute.max_memory * 1e9)
     return StageContext(progress, device, backend, threads, max_memory_bytes=most)
+
+
+def light_context(compute: ComputeConfig, progress: Progress) -> StageContext:
+    """Returns where to draw a few views: with numba without torch, if that may be and is ready."""
+    if (compute.backend in ("auto", "numba") and compute.device in ("auto", "cpu")
+            and find_spec("numba")):
+        from recon_cli.kernels.kernel import is_warm
+
+        if is_warm():
+            from recon_cli.kernels.thread_pool import pool
+
+            pool.threads = compute.threads or machine.usable_threads()
+            return StageContext(progress, "cpu", "numba", pool.threads)
+    return render_context(compute, progress)
 
 
 def _prepare_kernels(progress: Progress, backend: str) -> None:

@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2, vq
 
 from recon_cli.splats.values import Floats
 
@@ -57,6 +56,8 @@ def fit_palette(
     rows = rows[first]
     peak = max(float(np.abs(rows).max()), float(np.finfo(np.float32).tiny))
     rows = rows / np.float32(peak)  # so that no square overflows
+    from scipy.cluster.vq import vq  # half a second, which reading does not need
+
     groups, errors = _group_rows(rows, max(1, round(math.sqrt(size))), rng)
     shares = errors / max(errors.sum(), np.finfo(np.float64).tiny)
     spare = size - len(shares)
@@ -69,7 +70,8 @@ def fit_palette(
             continue
         wanted = min(1 + int(share * spare), max(1, _PAIRS // len(members)))
         centres = _lloyd(rows[members], _choose_starts(rows[members], wanted, rng), _ROUNDS)
-        used, own = np.unique(vq(rows[members], centres, check_finite=False)[0], return_inverse=True)
+        nearest, _ = vq(rows[members], centres, check_finite=False)
+        used, own = np.unique(nearest, return_inverse=True)
         entries.append(centres[used])
         labels[members] = total + own
         total += len(used)
@@ -80,6 +82,8 @@ def _group_rows(
     rows: Floats, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Returns the group of each row [M] and the squared error of each group."""
+    from scipy.cluster.vq import vq
+
     sample = rows[np.sort(
         rng.choice(len(rows), min(len(rows), count * _ROWS_A_GROUP), replace=False))]
     centres = _lloyd(sample, _choose_starts(sample, count, rng), _ROUNDS)
@@ -115,6 +119,8 @@ def fit_centres_on_line(
 
 
 def _lloyd(rows: NDArray[_Float], start: NDArray[_Float], rounds: int) -> NDArray[_Float]:
+    from scipy.cluster.vq import kmeans2
+
     with warnings.catch_warnings():  # a centre without rows keeps its value
         warnings.simplefilter("ignore", UserWarning)
         centres, _ = kmeans2(
