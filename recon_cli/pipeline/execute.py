@@ -10,7 +10,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -264,15 +263,12 @@ def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:
 
 def light_context(compute: ComputeConfig, progress: Progress) -> StageContext:
     """Returns where to draw a few views: with numba without torch, if that may be and is ready."""
+    from recon_cli.render import drawing  # imports numpy
+
+    threads = compute.threads or machine.usable_threads()
     if (compute.backend in ("auto", "numba") and compute.device in ("auto", "cpu")
-            and find_spec("numba")):
-        from recon_cli.kernels.kernel import is_warm
-
-        if is_warm():
-            from recon_cli.kernels.thread_pool import pool
-
-            pool.threads = compute.threads or machine.usable_threads()
-            return StageContext(progress, "cpu", "numba", pool.threads)
+            and drawing.use_kernels(threads)):
+        return StageContext(progress, "cpu", "numba", threads)
     return render_context(compute, progress)
 
 

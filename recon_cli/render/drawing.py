@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +35,17 @@ class _Totals:
     blend_max: Floats
     broken: int = 0
     keep_ellipses: bool = field(default=False, init=False)
+
+
+def use_kernels(threads: int) -> bool:
+    """Returns whether the kernels of numba are compiled; they run in so many threads then."""
+    if not find_spec("numba"):
+        return False
+    from recon_cli.kernels.kernel import is_warm
+    from recon_cli.kernels.thread_pool import pool
+
+    pool.threads = threads
+    return is_warm()
 
 
 def draw(

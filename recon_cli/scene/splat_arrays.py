@@ -78,7 +78,7 @@ class SplatArrays:
     def opacities(self) -> Floats:
         """Opacities in (0, 1), [N]."""
         with np.errstate(over="ignore"):
-            return 1 / (1 + np.exp(-self.logit_opacities))
+            return np.asarray(1 / (1 + np.exp(-self.logit_opacities)), np.float32)
 
     @property
     def background(self) -> Floats:
