@@ -5,7 +5,8 @@ import pytest
 import torch
 from small_room import dots
 
-from recon_cli.trust.poorly_seen import PoorlySeenRegion, find_poorly_seen
+from recon_cli.trust.poorly_seen import find_poorly_seen
+from recon_cli.trust.records import PoorlySeenRegion
 from recon_cli.trust.support import ViewSupport
 from recon_cli.trust.surface import find_cells
 
