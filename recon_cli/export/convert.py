@@ -200,7 +200,7 @@ def _join(scenes: Sequence[LoadedScene], similarities: Sequence[Similarity]) -> 
     for scene, similarity in zip(scenes, similarities, strict=True):
         part = scene.splats if similarity.is_identity else transformed(scene.splats, similarity)
         parts.append(part.with_degree(degree) if part.sh_degree < degree else part)
-    return (parts[0] if len(parts) == 1 else joined(parts)[0]).arrays()
+    return (parts[0] if len(parts) == 1 else joined(parts)[0]).as_arrays()
 
 
 def _moved(by: tuple[float, float, float]) -> Similarity:
@@ -269,8 +269,8 @@ class _Reducer:
         from recon_cli.export.reduce import LowerDegrees
 
         cameras = [view.camera for view in self._scene.train]
-        return LowerDegrees(splats.tensors(), cameras, backend=self._ctx.backend,
-                            device=self._ctx.device).at(degree).arrays()
+        return LowerDegrees(splats.as_tensors(), cameras, backend=self._ctx.backend,
+                            device=self._ctx.device).at(degree).as_arrays()
 
     def reduce(
         self, request: ConvertRequest, size_of: Callable[[Splats], int]
@@ -279,7 +279,7 @@ class _Reducer:
         from recon_cli.export.cleanup import drop_floaters_without_views, drop_islands
         from recon_cli.export.reduce import crop, fit_to_size, measure_change
 
-        splats = self._splats.tensors()
+        splats = self._splats.as_tensors()
 
         def step(option: str, after: Splats) -> Splats:
             measure_change(option, splats, after, self.psnr.psnr_db)
@@ -294,16 +294,16 @@ class _Reducer:
             splats = step("crop", crop(splats, request.crop))
         if request.sh_degree is not None and request.sh_degree < splats.sh_degree:
             splats = step(
-                "sh_degree", self.at_degree(splats.arrays(), request.sh_degree).tensors())
+                "sh_degree", self.at_degree(splats.as_arrays(), request.sh_degree).as_tensors())
         if request.max_gaussians is not None and request.max_gaussians < len(splats):
             splats = step("max_gaussians", _coarsened(splats, request.max_gaussians))
         if request.max_mb is not None:
             whole = splats
             splats = step("max_mb", fit_to_size(
                 splats, int(1e6 * request.max_mb), size_of=size_of, fewer=_coarsened,
-                at_degree=lambda degree: self.at_degree(whole.arrays(), degree).tensors(),
+                at_degree=lambda degree: self.at_degree(whole.as_arrays(), degree).as_tensors(),
                 psnr_db=self.psnr.psnr_db))
-        return splats.arrays()
+        return splats.as_arrays()
 
 
 def _coarsened(splats: Splats, count: int) -> Splats:

@@ -49,7 +49,7 @@ def synthetic_scene(
     four stand where there is most space inside and look outward. `up` is a unit vector [3] along z
     or y; `max_size` is the longest side in pixels.
     """
-    arrays = splats.arrays()
+    arrays = splats.as_arrays()
     opaque = arrays.opacities >= MIN_OPACITY
     used = opaque if opaque.any() else ~opaque
     means = arrays.means[used].astype(np.float64)

@@ -78,7 +78,7 @@ def file_size(row: ExportFormat, path: Path) -> int:
 def verify_ply(path: Path, splats: Splats | SplatArrays, *, again: str = "") -> None:
     """Raises WorkspaceError unless a .ply reads back as exactly these Gaussians."""
     back = read_arrays(path).parameters()
-    for name, value in splats.arrays().parameters().items():
+    for name, value in splats.as_arrays().parameters().items():
         read = back[name]
         if name == "sh_rest":  # trailing rows of zeros are not stored
             value, read = trim_zero_rows(value), trim_zero_rows(read)
@@ -103,7 +103,7 @@ class ReferencePsnr:
         """Returns the mean PSNR of a scene over the views in dB."""
         from recon_cli.evaluation.reference_views import mean_psnr
 
-        on_device = splats.tensors().map(lambda tensor: tensor.to(self.ctx.device))
+        on_device = splats.as_tensors().map(lambda tensor: tensor.to(self.ctx.device))
         return mean_psnr(on_device, self.views, on_device.sh_degree, self.ctx.backend)
 
 

@@ -54,12 +54,12 @@ def draw(
 ) -> Drawing:
     """Returns what a camera sees of a scene; errors are those of `render.registry.render`."""
     if backend == "numba":
-        return _draw_with_numba(splats.arrays(), camera, sh_degree, count)
+        return _draw_with_numba(splats.as_arrays(), camera, sh_degree, count)
     import torch
 
     from recon_cli.render.registry import render
 
-    there = splats.tensors().map(lambda tensor: tensor.to(device))
+    there = splats.as_tensors().map(lambda tensor: tensor.to(device))
     with torch.no_grad():
         output = render(there, camera, there.background, sh_degree, backend=backend, scores=count)
     return Drawing(output.rgb.cpu().numpy(), output.alpha.cpu().numpy(),
@@ -78,7 +78,8 @@ def _draw_with_numba(
     )
 
     n, pixels = len(splats), camera.width * camera.height
-    totals: Any = _Totals(*(np.zeros(n, kind) for kind in ("f4", "i8", "f4", "f4")))
+    totals: Any = _Totals(np.zeros(n, np.float32), np.zeros(n, np.int64),
+                          *(np.zeros(n, np.float32) for _ in range(2)))
     image = ImageBuffers(*(np.empty(size, np.float32) for size in (3 * pixels, pixels, pixels)))
     with without_scipy():
         Lease().view_pass.forward(

@@ -38,6 +38,14 @@ class SplatArrays:
     def __len__(self) -> int:
         return len(self.means)
 
+    @staticmethod
+    def from_parameters(
+        parameters: Mapping[str, Floats], backdrop: Backdrop | None = None
+    ) -> SplatArrays:
+        """Returns Gaussians of the raw parameters by name."""
+        return SplatArrays(*(parameters[item.name] for item in fields(SplatArrays)[:-1]),
+                           backdrop=backdrop)
+
     def parameters(self) -> dict[str, Floats]:
         """Returns the raw parameters by name, in declaration order; no copies."""
         return {item.name: getattr(self, item.name) for item in fields(self)[:-1]}
@@ -62,7 +70,7 @@ class SplatArrays:
         return replace(self._changed(together), backdrop=None)
 
     def _changed(self, values: Mapping[str, Floats]) -> SplatArrays:
-        return SplatArrays(**{**self.parameters(), **values}, backdrop=self.backdrop)
+        return SplatArrays.from_parameters({**self.parameters(), **values}, self.backdrop)
 
     @property
     def sh_degree(self) -> int:
@@ -85,11 +93,11 @@ class SplatArrays:
         """The colour behind all Gaussians, [3] in [0, 1]."""
         return np.array((0, 0, 0) if self.backdrop is None else self.backdrop.color, np.float32)
 
-    def arrays(self) -> SplatArrays:
-        """Returns the same, as `Splats.arrays` does of tensors."""
+    def as_arrays(self) -> SplatArrays:
+        """Returns the same, as `Splats.as_arrays` does of tensors."""
         return self
 
-    def tensors(self) -> Splats:
+    def as_tensors(self) -> Splats:
         """Returns the same as tensors of torch, which share the memory."""
         import torch
 

@@ -74,13 +74,13 @@ class Splats:
         """Returns the raw parameters by name, in declaration order; no copies."""
         return {name: getattr(self, name) for name in PARAMETERS}
 
-    def arrays(self) -> SplatArrays:
+    def as_arrays(self) -> SplatArrays:
         """Returns the raw parameters as float32 arrays, detached and on the CPU."""
         return SplatArrays(*(value.detach().cpu().float().numpy()
                              for value in self.parameters().values()), backdrop=self.backdrop)
 
-    def tensors(self) -> Self:
-        """Returns the same, as `SplatArrays.tensors` does of arrays."""
+    def as_tensors(self) -> Self:
+        """Returns the same, as `SplatArrays.as_tensors` does of arrays."""
         return self
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:

@@ -58,7 +58,7 @@ class LoadedScene:
     @cached_property
     def splats(self) -> Splats:
         """The Gaussians as tensors."""
-        return self.arrays.tensors()
+        return self.arrays.as_tensors()
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,4 +118,4 @@ class SplatFormat:
     ) -> None:
         """Writes a file, whole or not at all."""
         assert self.write_with is not None, "a format that is only read"
-        self.write_with(path, splats.arrays(), settings or WriteSettings())
+        self.write_with(path, splats.as_arrays(), settings or WriteSettings())

@@ -199,7 +199,7 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
             total += len(part)
             if total * _LEAST_BYTES > container.size:
                 raise container.error(f"{total} Gaussians in {container.size} bytes")
-            parts.append(transformed(part.tensors(), similarity))
+            parts.append(transformed(part.as_tensors(), similarity))
     if not parts:
         raise FormatError(
             f"{path} holds a mesh or points, but no Gaussians (no primitive with {_NAME}).",
@@ -213,7 +213,7 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
         axes = _AXES.get(_read_axes(container.json), Z_UP)
     up = next((name for name, known in _UP.items() if np.array_equal(known, axes)), None)
     return LoadedScene(
-        transformed(splats, Similarity(rotation=axes.T)).arrays(), up,
+        transformed(splats, Similarity(rotation=axes.T)).as_arrays(), up,
         writer=container.generator(container.json))
 
 
@@ -430,7 +430,7 @@ class Container(UntrustedFile):
 
 def _write_with(path: Path, splats: SplatArrays, settings: WriteSettings) -> None:
     axes = Z_UP if settings.up is None else nearest_axes(settings.up)
-    write_glb(path, splats.with_sphere().tensors(), axes=axes)
+    write_glb(path, splats.with_sphere().as_tensors(), axes=axes)
 
 
 FORMAT = SplatFormat(load_glb, _write_with, load_unturned=lambda path: load_glb(path, axes=Y_UP))

@@ -89,7 +89,7 @@ class PageStyle:
 
 def default_view(splats: Splats | SplatArrays, up: NDArray[np.float64]) -> View:
     """Returns a camera in front of the scene and a little above it, looking at its middle."""
-    middle, radius = measure_extent(splats.arrays().means)
+    middle, radius = measure_extent(splats.as_arrays().means)
     reach = radius or 1.0
     back = np.array([0.0, -1, 0]) if abs(up[1]) < 0.5 else np.array([0.0, 0, np.sign(up[1])])
     back -= (back @ up) * up
@@ -197,7 +197,7 @@ def write_html(
     visitor can step through the cameras of `views`; the page opens on its tour, at the first of
     them, or in front of the scene. The errors are those of `spz_bytes`.
     """
-    splats = splats.arrays()
+    splats = splats.as_arrays()
     halvings = _halvings(splats)
     # beside the scripts size hardly counts
     packed = spz_bytes(path, turn_from(_STORED, _enlarged(splats, -halvings)), harmonic_step=1,
@@ -267,7 +267,7 @@ def load_html(path: Path) -> LoadedScene:
 
 
 def _write_with(path: Path, splats: SplatArrays, settings: WriteSettings) -> None:
-    guide = settings.guide(splats.tensors()) if settings.guide is not None else None
+    guide = settings.guide(splats.as_tensors()) if settings.guide is not None else None
     preview = path.with_suffix(".jpg")
     if guide is not None:
         write_bytes(preview, guide.poster)

@@ -258,7 +258,7 @@ def load_lod(path: Path) -> LoadedScene:
 
     parts = []
     for archive, file in zip_longest(archives, sorted(wanted)):
-        piece = read_files(archive).tensors()
+        piece = read_files(archive).as_tensors()
         if file is not None:  # else it is the environment, all of which is shown
             rows = np.concatenate([np.arange(at, at + count) for at, count in wanted[file]])
             piece = piece.select(torch.from_numpy(rows))
@@ -267,7 +267,7 @@ def load_lod(path: Path) -> LoadedScene:
         raise index.error("a tree without Gaussians")
     degree = max(part.sh_degree for part in parts)
     return LoadedScene(
-        joined([part.with_degree(degree) for part in parts])[0].arrays(), index.up(index.meta),
+        joined([part.with_degree(degree) for part in parts])[0].as_arrays(), index.up(index.meta),
         writer=index.generator(index.meta))
 
 
@@ -330,5 +330,5 @@ class _Index(UntrustedFile):
 FORMAT = SplatFormat(
     load_lod,
     lambda path, splats, settings: write_lod(
-        path, make_levels(splats.with_sphere().tensors()), sharing=settings.sharing,
+        path, make_levels(splats.with_sphere().as_tensors()), sharing=settings.sharing,
         up=settings.up_axis))

@@ -89,7 +89,7 @@ def write_ply(
     skip them. Those of the backdrop's sphere, which has none of its own, are the greatest.
     """
     backdrop, splats = splats.backdrop, splats.with_sphere()
-    arrays = splats.arrays()
+    arrays = splats.as_arrays()
     n, rest = len(arrays), arrays.sh_rest if len(arrays.sh_rest) else arrays.sh_rest[:, :0]
     extra = {name: np.pad(values, (0, n - len(values)), constant_values=values.max(initial=0.0))
              for name, values in (extra or {}).items()}
@@ -149,7 +149,7 @@ def max_gaussians(size: int, sh_degree: int, backdrop: Backdrop | None = None) -
 
 def read_ply(path: Path) -> Splats:
     """Returns the Gaussians of a .ply as float32 tensors; see `read_arrays`."""
-    return read_arrays(path).tensors()
+    return read_arrays(path).as_tensors()
 
 
 def read_arrays(path: Path) -> SplatArrays:

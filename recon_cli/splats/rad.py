@@ -358,4 +358,4 @@ def _pack_json(magic: bytes, meta: Mapping[str, Any]) -> bytes:
 
 FORMAT = SplatFormat(
     load_rad, lambda path, splats, settings: write_rad(
-        path, splats.tensors().with_sphere(), up=settings.up_axis))
+        path, splats.as_tensors().with_sphere(), up=settings.up_axis))

@@ -74,7 +74,7 @@ def put_in_place(scene: LoadedScene, name: str) -> Splats:
     logger.warning("%s: %s, and added again here, rounded; %s leaves it out",
                    name, scene.origin.describe(), name_command("import"))
     means = scene.arrays.means + np.array(scene.origin.point, np.float32)
-    return replace(scene.arrays, means=means).tensors()
+    return replace(scene.arrays, means=means).as_tensors()
 
 
 def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:

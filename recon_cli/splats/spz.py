@@ -141,7 +141,7 @@ def spz_bytes(
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is not one of {VERSIONS}")
-    values = SplatArrays(**to_arrays(splats, path.name))
+    values = SplatArrays.from_parameters(to_arrays(splats, path.name))
     means, quats, log_scales = values.means, values.quats, values.log_scales
     large = int((log_scales.max(axis=1) > _LARGEST_SCALE).sum())
     if large:

@@ -205,7 +205,7 @@ def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> SplatA
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
     refuse_not_finite(path, plain)
     plain["sh_rest"] = trim_zero_rows(plain["sh_rest"]).copy()
-    return SplatArrays(**plain)
+    return SplatArrays.from_parameters(plain)
 
 
 def refuse_above(path: Path, log_scales: Floats, most: float) -> None:
@@ -274,7 +274,7 @@ def to_arrays(splats: Splats | SplatArrays, kind: str) -> dict[str, NDArray[np.f
     """
     if not len(splats):
         raise FormatError(f"There are no Gaussians to write; a {kind} needs at least one.")
-    arrays = splats.arrays()
+    arrays = splats.as_arrays()
     table, rest = arrays.parameters(), arrays.sh_rest
     table["sh_rest"] = np.pad(rest[:, :rest.shape[1] if len(rest) else 0],
                               ((0, len(arrays) - len(rest)), (0, 0), (0, 0)))
