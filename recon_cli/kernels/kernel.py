@@ -17,7 +17,8 @@ import pickle
 import platform
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
 Compiled = Callable[..., Any]
 CODE = ".nbc"  # end of the name of a file of machine code
+READY = "ready"  # file in the cache folder once every kernel is there
+_SCIPY = "scipy.linalg"
 unsaved: list[OSError] = []  # why kernels were not kept
 
 
@@ -126,6 +129,25 @@ def cache_folder() -> Path | None:
             "RECON_CACHE_DIR to a folder of your own.", folder)
         return None
     return folder
+
+
+def is_warm() -> bool:
+    """Tells whether machine code for this CPU is there."""
+    folder = cache_folder()
+    return folder is not None and (folder / READY).exists()
+
+
+@contextmanager
+def without_scipy() -> Iterator[None]:
+    """Keeps numba from importing scipy.linalg, slowly, for a BLAS that no kernel needs."""
+    if _SCIPY in sys.modules:
+        yield
+        return
+    sys.modules[_SCIPY] = None  # type: ignore[assignment]  # an import of it fails at once
+    try:
+        yield
+    finally:
+        del sys.modules[_SCIPY]
 
 
 def fingerprint() -> str:

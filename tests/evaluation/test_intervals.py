@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from recon_cli.evaluation.intervals import Spread, paired_bootstrap, paired_t
 
@@ -26,6 +25,8 @@ def test_two_seeds_give_the_interval_of_the_cauchy_distribution():
 
 @pytest.mark.parametrize("n", [2, 3, 5, 12])
 def test_the_interval_is_that_of_the_paired_t_test(n):
+    from scipy import stats  # takes a second
+
     generator = np.random.default_rng(n)
     ours, theirs = generator.normal(0.3, 1, n), generator.normal(0, 1, n)
     found = paired_t(ours.tolist(), theirs.tolist())

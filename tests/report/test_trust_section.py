@@ -12,8 +12,7 @@ from recon_cli.io.colmap import read_scene
 from recon_cli.report.capture import draw_plan, find_axes
 from recon_cli.report.trust_section import TrustSection
 from recon_cli.scene.scene import Scene
-from recon_cli.trust.poorly_seen import PoorlySeenRegion
-from recon_cli.trust.scene_trust import RECORD
+from recon_cli.trust.records import RECORD, PoorlySeenRegion
 
 REGION = PoorlySeenRegion(position=(0.1, 0.2, 1.5), size=1.0, share=0.05, few=True, views=2,
                           span_deg=3.0, frame="<b>000001</b>.png")

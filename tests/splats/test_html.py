@@ -70,7 +70,7 @@ def test_a_page_reads_back_as_the_spz_of_the_same_scene(tmp_path, degree):
     splats = room(500, degree=degree)
     write_html(tmp_path / "a.html", splats)
     finest = spz_bytes(
-        tmp_path / "a.spz", turn_from("rub", splats), harmonic_step=1)
+        tmp_path / "a.spz", turn_from("rub", splats.as_arrays()), harmonic_step=1)
     (tmp_path / "a.spz").write_bytes(finest)
     page = load_html(tmp_path / "a.html").splats
     spz = load_spz(tmp_path / "a.spz", axes="rub").splats

@@ -50,7 +50,7 @@ def test_each_level_has_a_quarter_of_the_one_before(tmp_path):
 def test_the_leaves_hold_every_gaussian_of_every_level_once(tmp_path):
     levels = written(tmp_path)
     meta = meta_of(tmp_path)
-    files = [read_files(Unpacked(tmp_path / name)) for name in meta["filenames"]]
+    files = [read_files(Unpacked(tmp_path / name)).as_tensors() for name in meta["filenames"]]
     assert len(files) > len(levels)
     for level, splats in enumerate(levels):
         seen = {file: torch.zeros(len(part), dtype=torch.int64) for file, part in enumerate(files)}

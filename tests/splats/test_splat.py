@@ -8,7 +8,7 @@ from splat_cases import N, edge_splats, greatest, rotation_error
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import SH_C0
-from recon_cli.splats.splat import read_splat, write_splat
+from recon_cli.splats.splat import FORMAT, write_splat
 
 
 def in_order(splats):
@@ -26,7 +26,7 @@ def written(tmp_path):
 
 def test_each_parameter_is_within_its_step(written):
     path, splats = written
-    back = read_splat(path)
+    back = FORMAT.read(path)
     assert torch.equal(back.means, splats.means)
     assert greatest(back.log_scales, splats.log_scales) < 1e-6 * 10  # float32
     assert greatest(back.opacities, splats.opacities) <= 0.5 / 255 + 1e-7
@@ -61,7 +61,7 @@ def test_the_most_important_gaussian_comes_first(written):
 
 def test_bytes_stay_when_a_file_is_read_and_written_again(written, tmp_path):
     path, _ = written
-    write_splat(tmp_path / "b.splat", read_splat(path))
+    write_splat(tmp_path / "b.splat", FORMAT.read(path))
     rows, again = (np.frombuffer(p.read_bytes(), np.uint8).reshape(N, 32)
                    for p in (path, tmp_path / "b.splat"))
     by_mean, by_mean_again = (np.lexsort(r[:, :12].T) for r in (rows, again))
@@ -72,7 +72,7 @@ def test_scales_beyond_float32_are_clamped_below_and_refused_above(tmp_path):
     splats = edge_splats(0)
     splats.log_scales[7] = -300
     write_splat(tmp_path / "a.splat", splats)
-    assert read_splat(tmp_path / "a.splat").log_scales.min() == pytest.approx(-87.3365, abs=1e-3)
+    assert FORMAT.read(tmp_path / "a.splat").log_scales.min() == pytest.approx(-87.3365, abs=1e-3)
     splats.log_scales[7] = 90
     with raises(FormatError, 1, "Gaussians"):
         write_splat(tmp_path / "b.splat", splats)
@@ -82,9 +82,9 @@ def test_scales_beyond_float32_are_clamped_below_and_refused_above(tmp_path):
 @pytest.mark.parametrize(("at", "number"), [(4, np.nan), (16, np.inf), (16, np.nan)])
 def test_a_gaussian_that_is_not_finite_is_left_out_and_counted(written, caplog, at, number):
     path, _ = written
-    whole, data = read_splat(path), path.read_bytes()
+    whole, data = FORMAT.read(path), path.read_bytes()
     path.write_bytes(data[:at] + np.float32(number).tobytes() + data[at + 4:])
-    left = read_splat(path)
+    left = FORMAT.read(path)
     assert torch.equal(left.means, whole.means[1:])
     assert torch.equal(left.sh_dc, whole.sh_dc[1:])
     assert_facts(caplog.text, 1, len(whole), "Gaussians", "left")

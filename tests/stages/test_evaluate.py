@@ -20,7 +20,8 @@ from recon_cli.io.images import read_image, write_png
 from recon_cli.io.training_scene import load_scene
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import evaluate
-from recon_cli.trust.scene_trust import Trust, TrustRecord, digest_of
+from recon_cli.trust.records import TrustRecord
+from recon_cli.trust.scene_trust import Trust, digest_of
 from recon_cli.workspace.records import ImportRecord
 
 

@@ -6,7 +6,8 @@ import torch
 from facts import assert_facts
 from small_room import dots
 
-from recon_cli.trust.poorly_seen import PoorlySeenRegion, find_poorly_seen
+from recon_cli.trust.poorly_seen import find_poorly_seen
+from recon_cli.trust.records import PoorlySeenRegion
 from recon_cli.trust.support import ViewSupport
 from recon_cli.trust.surface import find_cells
 

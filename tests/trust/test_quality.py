@@ -7,15 +7,13 @@ import summaries
 from facts import assert_facts
 
 from recon_cli.evaluation.scores import Metrics, ModelMetrics, ViewScore
-from recon_cli.trust.poorly_seen import PoorlySeenRegion
 from recon_cli.trust.quality import (
     describe_quality,
     find_doubtful_cameras,
     find_failed_views,
     read_quality,
 )
-from recon_cli.trust.scene_trust import ModelTrust, TrustRecord
-from recon_cli.trust.surface import SurfaceShares
+from recon_cli.trust.records import ModelTrust, PoorlySeenRegion, SurfaceShares, TrustRecord
 from recon_cli.workspace.records import Frame
 
 TRUSTED = dataclasses.replace(
