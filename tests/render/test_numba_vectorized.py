@@ -47,7 +47,7 @@ HOT = [
     Hot("project", "spherical harmonics", 8),
     Hot("composite", "colour in a patch of pixels", 13, powers=True),
     Hot("composite", "patches of a batch", 13),
-    Hot("composite_backward", "gradients in a patch of pixels", 34, powers=True),
+    Hot("composite_backward", "gradients in a patch of pixels", 28, powers=True),
     Hot("project_backward", "a block of Gaussians", 280, powers=True),
     Hot("project_backward", "gradients of spherical harmonics", 8),
     Hot("similarity", "blur along the row, and SSIM", 45),

@@ -104,8 +104,7 @@ class _Render(torch.autograd.Function):
             PackedSplats.from_tensors(tensors), PackedSplats.from_tensors(gradients),
             ImageBuffers(flat(grad_rgb), *(nothing if gradient is None else flat(gradient)
                                            for gradient in (grad_alpha, grad_depth))),
-            ctx.statistics,
-            details=True, loo=ctx.scores)
+            ctx.statistics, loo=ctx.scores)
         if ctx.statistics.keep_ellipses:
             ctx.statistics.ellipses = ctx.lease.view_pass.ellipse_gradients()
         grad_background = None

@@ -214,19 +214,19 @@ class ViewPass:
 
     def backward(
         self, splats: PackedSplats, gradients: PackedSplats, image: ImageBuffers,
-        statistics: Statistics, *, details: bool, loo: bool, harmonics: bool = True,
+        statistics: Statistics, *, loo: bool, harmonics: bool = True,
     ) -> None:
         """Writes gradients and statistics of all N Gaussians for the last forward pass.
 
         `image` holds the gradients of the loss; sh_rest of `gradients` is left alone at degree 0
-        and without `harmonics`. With `details` variance is written too, with `loo` that, over the
-        pixels that counted in the forward pass.
+        and without `harmonics`. With `loo` that is written too, over the pixels that counted in
+        the forward pass.
         """
         sums = self.take("sums", len(self.members) * SLOT)
         pool.run(
             composite_backward, self.tile_start, self.members, self.slots, self.records,
             self.view.width, self.view.height, self.tiles_x, self.cutoff, self.background,
-            self.final, self.last, self.met, image.rgb, image.alpha, image.depth, details, loo,
+            self.final, self.last, self.met, image.rgb, image.alpha, image.depth, loo,
             self.counting, sums)
         pool.run(
             project_backward, self.ids, self.block_starts, self.slot_start, sums, self.depths,
