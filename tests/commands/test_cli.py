@@ -12,9 +12,22 @@ import pytest
 from facts import assert_facts
 from fake_stages import NAMES
 
-from recon_cli import __version__
+from recon_cli import __version__, errors
 from recon_cli.cli import VERBS, cli, main
 from recon_cli.commands import jobs, stages, workspace
+from recon_cli.errors import (
+    BackendError,
+    ConfigError,
+    FormatError,
+    InputError,
+    ManifestError,
+    ReconError,
+    ReconstructionError,
+    SfmError,
+    StageError,
+    TrainingError,
+    WorkspaceError,
+)
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import StageStatus
 from recon_cli.train.plan import QUALITIES
@@ -273,22 +286,37 @@ def _raise(error: BaseException) -> None:
     raise error
 
 
-@pytest.mark.parametrize(("error", "code", "said"), [
-    (KeyboardInterrupt(), 130, "interrupted; run the same command again to resume"),
-    (OSError(errno.ENOSPC, "No space left"), 7, "MB free"),
-    (OSError(errno.EFBIG, "File too large"), 7, "larger than"),
-    (PermissionError(errno.EACCES, "Permission denied"), 7, "not writable"),
-    (ZeroDivisionError("by zero"), 1, "error: ZeroDivisionError: by zero"),
+CODES: dict[type[ReconError], int] = {
+    ConfigError: 2, InputError: 3, FormatError: 3, StageError: 4, ReconstructionError: 5,
+    SfmError: 5, TrainingError: 5, BackendError: 6, WorkspaceError: 7, ManifestError: 7}
+
+
+def test_every_class_of_errors_has_its_exit_code_here() -> None:
+    assert CODES.keys() == {item for item in vars(errors).values() if isinstance(item, type)
+                            and issubclass(item, ReconError) and item is not ReconError}
+
+
+@pytest.mark.parametrize(("error", "code", "facts"), [
+    *((kind("28.jpg is dark.", hint="Type this."), code, ["error:", "28.jpg"])
+      for kind, code in CODES.items()),
+    (KeyboardInterrupt(), 130, ["interrupted", "again"]),
+    (OSError(errno.ENOSPC, "No space left"), 7, ["error:", "MB"]),
+    (OSError(errno.EFBIG, "File too large"), 7, ["error:", "larger"]),
+    (PermissionError(errno.EACCES, "Permission denied"), 7, ["error:", "writable"]),
+    (ZeroDivisionError("by zero"), 1, ["error:", "ZeroDivisionError", "zero"]),
 ])
 def test_what_a_stage_raises_becomes_an_exit_code(
-    error: BaseException, code: int, said: str, capsys: Said
+    error: BaseException, code: int, facts: list[str], capsys: Said
 ) -> None:
     fake_stages.actions["ingest"] = lambda: _raise(error)
     assert main(["ingest", "room.mp4"]) == code
     err = capsys.readouterr().err
-    assert said in err
+    assert_facts(err, *facts)
     assert "Traceback" not in err
-    assert "Traceback" in Path("workspace/recon.log").read_text()
+    if isinstance(error, ReconError):
+        assert_facts(err, "hint:", "Type this.")
+    else:
+        assert "Traceback" in Path("workspace/recon.log").read_text()
     del fake_stages.actions["ingest"]
     assert main(["ingest", "room.mp4"]) == 0
 

@@ -15,7 +15,7 @@ from recon_cli.io.images import read_image
 
 def test_up_that_is_not_known_is_said(before_a_wall, tmp_path, caplog):
     assert render(before_a_wall, "--path", "orbit", *SHORT, "--out", tmp_path / "out") == 0
-    assert_facts(caplog.text, "up")
+    assert_facts(caplog.text, "up", "known")
 
 
 def test_without_a_trained_model_the_command_to_type_is_named(copied, capsys):
