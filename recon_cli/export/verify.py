@@ -17,7 +17,8 @@ from recon_cli.errors import ReconstructionError, WorkspaceError, name_command
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
 from recon_cli.scene.splat_arrays import SplatArrays
-from recon_cli.splats.format import WriteSettings
+from recon_cli.splats.axes import flip
+from recon_cli.splats.format import LoadedScene, WriteSettings
 from recon_cli.splats.ply import read_arrays
 from recon_cli.splats.registry import FORMATS
 from recon_cli.splats.values import trim_zero_rows
@@ -52,11 +53,20 @@ def write_until_good(
         form.write(path, splats, dataclasses.replace(settings, sharing=sharing))
         if max_bytes is not None and file_size(row, path) > max_bytes:
             break
-        psnr_db = psnr.psnr_db(form.load(path).arrays)
+        psnr_db = psnr.psnr_db(_as_written(form.load(path), settings))
         gain = psnr_db - reference_db
         if limit.allows(gain, psnr_db):
             break
     return gain
+
+
+def _as_written(scene: LoadedScene, settings: WriteSettings) -> SplatArrays:
+    """Returns a scene in the axes that it was written in.
+
+    Of a file that says that y is up, reading turns it half round x, to -y.
+    """
+    turned = (scene.up, settings.up_axis) == ("-y", "y")
+    return flip(scene.arrays, [1, -1, -1]) if turned else scene.arrays
 
 
 def measure_size(row: ExportFormat, splats: Splats, settings: WriteSettings) -> int:

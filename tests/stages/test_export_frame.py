@@ -198,6 +198,13 @@ def test_an_spz_has_the_version_that_was_asked_for(inputs, version):
     assert header.version == version
 
 
+@pytest.mark.parametrize("name", AXES)
+def test_a_file_that_names_its_axes_is_checked_in_those(inputs, name):
+    """Reading version 4 turns what has y up; the check of the written file must not."""
+    _, summary = exported(inputs, format="spz", spz_version=4, up=name)
+    assert abs(summary.files["spz"].psnr_change_db) < 0.5
+
+
 @pytest.mark.integration
 def test_a_page_stands_upright_in_any_frame(inputs):
     up_is_z(inputs)
