@@ -137,8 +137,8 @@ MUTANTS = (
     Mutant("track-by-observation", "io/colmap.py", '}I")[::2]))', '}I")[1::2]))'),
     Mutant("gravity-up", "io/colmap.py", "viewmat[:3, :3] @ -up", "viewmat[:3, :3] @ up"),
     # splat formats
-    Mutant("ply-channel-order", "splats/ply.py",
-           'with_rows(raw["sh_rest"], n).transpose(1, 2)', 'with_rows(raw["sh_rest"], n)'),
+    Mutant("ply-channel-order", "splats/ply.py", "coefficients.reshape(n, 3",
+           "coefficients.transpose(0, 2, 1).reshape(n, 3"),
     Mutant("spz-quaternion-order", "splats/spz.py",
            "encode_smallest_three(quats[:, _XYZW])", "encode_smallest_three(quats)"),
     Mutant("ksplat-term-order", "splats/ksplat.py",

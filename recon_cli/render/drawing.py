@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +34,6 @@ class _Totals:
     blend_sum: Floats
     blend_max: Floats
     broken: int = 0
-    keep_ellipses: bool = field(default=False, init=False)
 
 
 def use_kernels(threads: int) -> bool:
@@ -79,7 +78,7 @@ def _draw_with_numba(
 
     n, pixels = len(splats), camera.width * camera.height
     totals: Any = _Totals(np.zeros(n, np.float32), np.zeros(n, np.int64),
-                          *(np.zeros(n, np.float32) for _ in range(2)))
+                          np.zeros(n, np.float32), np.zeros(n, np.float32))
     image = ImageBuffers(*(np.empty(size, np.float32) for size in (3 * pixels, pixels, pixels)))
     with without_scipy():
         Lease().view_pass.forward(
