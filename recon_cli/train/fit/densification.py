@@ -20,6 +20,7 @@ from torch import Tensor
 from recon_cli.errors import TrainingError
 from recon_cli.render.torch.projection import rotation_matrices
 from recon_cli.scene.splats import MOST_OPACITY, Splats, joined
+from recon_cli.splats.values import morton_order
 from recon_cli.train.fit.state import DensificationStats, TrainState
 from recon_cli.train.fit.task import Task
 
@@ -189,13 +190,26 @@ class Strategy:
 
 
 def replace_splats(state: TrainState, splats: Splats, source: Tensor) -> None:
-    """Replaces the Gaussians as `SplatOptimizer.replace`; TrainingError where none is left."""
+    """Replaces the Gaussians as `SplatOptimizer.replace`; TrainingError where none is left.
+
+    On a CPU they come in spatial order: those that a view sees lie together in memory.
+    """
     if len(splats) == 0:
         raise TrainingError(
             f"No Gaussian is left at step {state.iteration}.",
             hint="Lower --min-opacity, or check the cameras with another viewer.")
+    if splats.means.device.type == "cpu":
+        order = _spatial_order(splats)
+        splats, source = splats.select(order), source[order]
     state.optimizer.replace(splats, source)
     state.gathered = DensificationStats.zeros(len(splats), splats.means.device)
+
+
+def _spatial_order(splats: Splats) -> Tensor:
+    """Returns the rows [N] along a Z-order curve, those with coefficients first."""
+    order = torch.from_numpy(morton_order(splats.means.detach().numpy()))
+    plain = order >= len(splats.sh_rest)
+    return torch.cat([order[~plain], order[plain]])
 
 
 def _reference(state: TrainState, task: Task) -> None:
