@@ -190,26 +190,13 @@ class Strategy:
 
 
 def replace_splats(state: TrainState, splats: Splats, source: Tensor) -> None:
-    """Replaces the Gaussians as `SplatOptimizer.replace`; TrainingError where none is left.
-
-    On a CPU they come in spatial order: those that a view sees lie together in memory.
-    """
+    """Replaces the Gaussians as `SplatOptimizer.replace`; TrainingError where none is left."""
     if len(splats) == 0:
         raise TrainingError(
             f"No Gaussian is left at step {state.iteration}.",
             hint="Lower --min-opacity, or check the cameras with another viewer.")
-    if splats.means.device.type == "cpu":
-        order = _spatial_order(splats)
-        splats, source = splats.select(order), source[order]
     state.optimizer.replace(splats, source)
     state.gathered = DensificationStats.zeros(len(splats), splats.means.device)
-
-
-def _spatial_order(splats: Splats) -> Tensor:
-    """Returns the rows [N] along a Z-order curve, those with coefficients first."""
-    order = torch.from_numpy(morton_order(splats.means.detach().numpy()))
-    plain = order >= len(splats.sh_rest)
-    return torch.cat([order[~plain], order[plain]])
 
 
 def _reference(state: TrainState, task: Task) -> None:
@@ -236,9 +223,20 @@ def _budget(state: TrainState, task: Task) -> None:
         rule = BudgetRule(
             schedule.target(state.iteration, state.first_count), schedule.config.min_opacity,
             schedule.recipe.opacity_decay, schedule.replaced)
-        replace_splats(state, *densify_budget(
+        splats, source = densify_budget(
             state.splats, state.gathered.variance * task.inside(state.splats.means), rule,
-            state.generator))
+            state.generator)
+        if len(splats) and task.device.type == "cpu":  # what a view sees lies together in memory
+            order = _spatial_order(splats)
+            splats, source = splats.select(order), source[order]
+        replace_splats(state, splats, source)
+
+
+def _spatial_order(splats: Splats) -> Tensor:
+    """Returns the rows [N] along a Z-order curve, those with coefficients first."""
+    order = torch.from_numpy(morton_order(splats.means.detach().numpy()))
+    plain = order >= len(splats.sh_rest)
+    return torch.cat([order[~plain], order[plain]])
 
 
 STRATEGIES = {"reference": Strategy(_reference), "budget": Strategy(_budget, variance=True)}
