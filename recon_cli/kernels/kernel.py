@@ -33,7 +33,7 @@ from recon_cli import machine
 
 logger = logging.getLogger("recon")
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+_OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False, "no_cfunc_wrapper": True}
 Compiled = Callable[..., Any]
 CODE = ".nbc"  # end of the name of a file of machine code
 READY = "ready"  # file in the cache folder once every kernel is there
@@ -106,7 +106,8 @@ def _save(save: Callable[..., None], signature: Any, machine_code: Any) -> None:
 
 def inlined(function: Compiled) -> Compiled:
     """Compiles a function into every kernel that calls it."""
-    return numba.njit(**_OPTIONS, forceinline=True)(function)  # type: ignore[no-any-return]
+    return numba.njit(  # type: ignore[no-any-return]
+        **_OPTIONS, forceinline=True, no_cpython_wrapper=True)(function)
 
 
 @cache
