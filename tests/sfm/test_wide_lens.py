@@ -84,7 +84,7 @@ def test_a_lens_is_tried_on_as_many_pairs_as_may_change_the_answer(monkeypatch, 
     pairs = [(np.full((200, 2), pair), np.zeros((200, 2))) for pair in range(5)]
     tried = []
 
-    def explain(camera, sample, *, seed):
+    def explain(camera, sample, **_):
         tried.append(camera.model_name)
         if camera.model_name == wide_lens.ORDINARY:
             return 120
@@ -93,7 +93,7 @@ def test_a_lens_is_tried_on_as_many_pairs_as_may_change_the_answer(monkeypatch, 
     monkeypatch.setattr(wide_lens, "count_explained", explain)
     focal = wide_lens._find_focal(GROUP, pairs, seed=0)  # 600 of 1,000 against 640 or 615
     assert focal == (wide_lens.FOCALS[0] * WIDTH if found else None)
-    monkeypatch.setattr(wide_lens, "count_explained", lambda camera, sample, *, seed: (
+    monkeypatch.setattr(wide_lens, "count_explained", lambda camera, *_, **__: (
         tried.append(camera.model_name) or 195))
     tried.clear()
     assert wide_lens._find_focal(GROUP, pairs, seed=0) is None
