@@ -1,6 +1,5 @@
 """The database, the choice of pairs, and their matching."""
 
-import copy
 import io
 import sqlite3
 from contextlib import closing
@@ -21,7 +20,6 @@ from recon_cli.sfm import database
 from recon_cli.sfm.features import matching
 from recon_cli.sfm.features.features import extract_features
 from recon_cli.sfm.features.matching import (
-    _estimate_geometry,
     create_database,
     exhaustive_pairs,
     match_descriptors,
@@ -252,30 +250,6 @@ def test_any_number_of_threads_writes_the_same_rows(job, threads):
                            for table in ("matches", "two_view_geometries")])
     assert tables[0] == tables[1]
     assert [len(rows) for rows in tables[0]] == [3, 3]
-
-
-@pytest.mark.parametrize(("depth", "same"), [(2.0, False), (0.0, True)])
-@pytest.mark.parametrize("known", [False, True])
-def test_a_focal_length_is_estimated_only_where_a_plane_leaves_the_geometry_open(
-        depth, same, known):
-    generator = np.random.default_rng(0)
-    points = generator.uniform([-2, -2, 4 - depth], [2, 2, 4 + depth], (260, 3))
-    lens = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
-    lens.has_prior_focal_length = known
-    first = np.array(lens.img_from_cam(points)) + generator.normal(0, 0.5, (260, 2))
-    turn = pycolmap.Rotation3d(np.array([0.0, 0.2, 0.0])).matrix()
-    second = np.array(lens.img_from_cam(points @ turn.T + [-0.8, 0.1, 0.2]))
-    second[:60] = generator.uniform(0, 480, (60, 2))  # wrong
-    rows = np.repeat(np.arange(260, dtype=np.uint32)[:, None], 2, axis=1)
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = 0
-    found = _estimate_geometry(lens, first, lens, second, rows, options)
-    other = copy.copy(lens)
-    other.camera_id = 1 if same or known else 2  # COLMAP tells by these whether one lens took both
-    expected = pycolmap.estimate_two_view_geometry(lens, first, other, second, rows, options)
-    assert len(found.inlier_matches) >= 190
-    np.testing.assert_array_equal(found.F, expected.F)
-    np.testing.assert_array_equal(found.inlier_matches, expected.inlier_matches)
 
 
 def names(count):

@@ -283,6 +283,11 @@ def _write_geometries(
     options = _verification_options(job)
     images = {image.name: image for image in opened.read_all_images()}
     cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+    # Of two images of one camera COLMAP estimates a focal length that both have, in four times the
+    # time of a fundamental matrix; a lens that bends much fits it less.
+    others = {number: copy.copy(camera) for number, camera in cameras.items()}
+    for number, camera in others.items():
+        camera.camera_id = number + max(cameras)
     with ThreadPoolExecutor(job.threads) as pool:
         for start in range(0, len(pairs), CHUNK):
             some = pairs[start:start + CHUNK]
@@ -300,9 +305,9 @@ def _write_geometries(
                 first, second = pair
                 matches = (match_descriptors(rows[first], rows[second]) if known is None
                            else known[pair])
-                return matches, _estimate_geometry(
+                return matches, pycolmap.estimate_two_view_geometry(
                     cameras[images[first].camera_id], places[first],
-                    cameras[images[second].camera_id], places[second], matches, options)
+                    others[images[second].camera_id], places[second], matches, options)
 
             found = pool.map(find, some)
             for count, (pair, (matches, geometry)) in enumerate(
@@ -313,28 +318,6 @@ def _write_geometries(
                         opened.write_matches(*ids, matches)
                     opened.write_two_view_geometry(*ids, geometry)
                 done(count)
-
-
-def _estimate_geometry(
-    ours: pycolmap.Camera, first: NDArray[np.float64],  # [K, 2] pixels
-    theirs: pycolmap.Camera, second: NDArray[np.float64],  # [L, 2] pixels
-    matches: Matches, options: pycolmap.TwoViewGeometryOptions,
-) -> pycolmap.TwoViewGeometry:
-    """Returns the verified matches of two images.
-
-    Of two images of one camera COLMAP estimates the focal length, too, unless it is known, in four
-    times the time of a fundamental matrix. That leaves no more wrong matches, except where one
-    plane explains nearly all and so does not determine it: there cameras of a room came out 1.7
-    times as far off.
-    """
-    other = copy.copy(theirs)
-    if ours.camera_id == theirs.camera_id and not ours.has_prior_focal_length:
-        other.camera_id += 1
-    geometry = pycolmap.estimate_two_view_geometry(ours, first, other, second, matches, options)
-    flat = geometry.config == int(pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC)
-    if flat and other.camera_id != theirs.camera_id:
-        return pycolmap.estimate_two_view_geometry(ours, first, theirs, second, matches, options)
-    return geometry
 
 
 def _verification_options(job: MappingJob) -> pycolmap.TwoViewGeometryOptions:

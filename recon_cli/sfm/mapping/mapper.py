@@ -39,16 +39,9 @@ KEPT_SHARE = 0.5  # of the points of every image
 MODELS, START = "found.partial", "begun.partial"
 
 
-def map_incrementally(
-    job: MappingJob, report: Reporter, *, colors: bool = True
-) -> list[pycolmap.Reconstruction]:
-    """Returns every model that the incremental mapper finds, adjusted; they may share images.
-
-    Without `colors` no image is read, and points have none.
-    """
-    options = _options(job)
-    options.extract_colors = colors
-    return _map(job, report, options)
+def map_incrementally(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:
+    """Returns every model that the incremental mapper finds, adjusted; they may share images."""
+    return _map(job, report, _options(job))
 
 
 def map_relaxed(

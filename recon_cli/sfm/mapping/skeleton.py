@@ -55,8 +55,8 @@ SKELETON, COARSE_SKELETON = "skeleton", "skeleton.coarse"
 # Distances, in frames of a video, at which tracks are matches: enough for a path around a lost
 # frame. All up to 20 take twice as long; they are for videos that fall apart.
 TRACK_STEPS, ALL_TRACK_STEPS = (1, 2, 3, 5, 8, 13, 20), tuple(range(1, 21))
-# Adjustments with new points in between, of rough cameras, and once all frames are placed or
-# segments joined: there, on 300 frames, five take a tenth longer for 3.25 cm in place of 3.29.
+# Adjustments with new points in between once all frames are placed, or segments joined: there, on
+# 300 frames, five take a tenth longer for an error of 3.25 cm in place of 3.29.
 REST_ROUNDS = 2
 LOOP_ROUNDS = 2  # times that open loops are closed and the model is fitted again
 # Share of the neighbours with MIN_PAIR_INLIERS tracks above which a video hangs together by them.
@@ -214,7 +214,7 @@ def build_coarse_skeleton(job: MappingJob, report: Reporter) -> list[pycolmap.Re
         pairs = matching.near_or_similar_pairs(job, job.names)
     matching.match_pairs(coarse, pairs, report, phase="coarse")
     report.phase("first", len(job.names))
-    models = mapper.map_incrementally(coarse, _Counts(report), colors=False)
+    models = mapper.map_incrementally(coarse, _Counts(report))
     shutil.rmtree(folder)
     return sorted(models, key=mapper.model_size, reverse=True)
 
@@ -249,7 +249,7 @@ def build_skeleton(
     tracks = tracks.select({row: tracks.names[row] for row in keyframes})
     rows = range(len(keyframes))
     write_usable_matches(own, images, {}, tracks, rows)
-    models = mapper.map_incrementally(own, counts, colors=False)
+    models = mapper.map_incrementally(own, counts)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
     # without parallax. What tracks of a long video leave apart is left to the matches.
     whole, enough = len(keyframes) == len(job.names), ENOUGH_FRAMES * len(keyframes)
@@ -358,7 +358,7 @@ def _fit(job: MappingJob, skeleton: pycolmap.Reconstruction) -> pycolmap.Reconst
     poses = {image.name: image.cam_from_world() for image in registered_images(skeleton)}
     model = mapper.triangulate(
         job, merge_models.build_posed_model(job.database, skeleton, poses), rounds=1)
-    mapper.refine(job, model, REST_ROUNDS)
+    mapper.refine(job, model)
     return model
 
 
