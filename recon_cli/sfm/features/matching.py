@@ -9,7 +9,6 @@ COLMAP's, takes as long and loses 2.5% of them.
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -283,11 +282,6 @@ def _write_geometries(
     options = _verification_options(job)
     images = {image.name: image for image in opened.read_all_images()}
     cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-    # Of two images of one camera COLMAP estimates a focal length that both have, in four times the
-    # time of a fundamental matrix; a lens that bends much fits it less.
-    others = {number: copy.copy(camera) for number, camera in cameras.items()}
-    for number, camera in others.items():
-        camera.camera_id = number + max(cameras)
     with ThreadPoolExecutor(job.threads) as pool:
         for start in range(0, len(pairs), CHUNK):
             some = pairs[start:start + CHUNK]
@@ -307,7 +301,7 @@ def _write_geometries(
                            else known[pair])
                 return matches, pycolmap.estimate_two_view_geometry(
                     cameras[images[first].camera_id], places[first],
-                    others[images[second].camera_id], places[second], matches, options)
+                    cameras[images[second].camera_id], places[second], matches, options)
 
             found = pool.map(find, some)
             for count, (pair, (matches, geometry)) in enumerate(
