@@ -80,7 +80,8 @@ class SplatArrays:
     @property
     def scales(self) -> Floats:
         """Standard deviations along the own axes, [N, 3], world units."""
-        return np.exp(self.log_scales)
+        with np.errstate(over="ignore"):
+            return np.exp(self.log_scales)
 
     @property
     def opacities(self) -> Floats:

@@ -144,10 +144,11 @@ def test_train_prune_branches_off_in_the_middle() -> None:
 
 def test_the_compact_model_alone_needs_pruning(capsys: Said) -> None:
     assert main(["run", "room.mp4", "--compact-only", "--no-prune"]) == 2
-    assert main(["train", "--compact-only"]) == 2
-    assert_facts(capsys.readouterr().err, "--compact-only", "--prune")
+    assert_facts(capsys.readouterr().err, "--compact-only", "--no-prune")
     assert main(["run", "room.mp4", "--compact-only"]) == 0
     assert config_of("train")["compact_only"] is True
+    Path("workspace/recon.toml").write_text("[train]\ncompact_only = true\n")
+    assert main(["run", "room.mp4", "--no-prune"]) == 2
 
 
 def test_pruning_options_without_prune_are_a_usage_error(capsys: Said) -> None:

@@ -219,7 +219,7 @@ def test_pruning_takes_every_step_where_training_did(inputs, tmp_path):
         PruneConfig(at="mid"), both, tmp_path / "prune", CONTEXT).iterations == 160
 
 
-def test_whoever_wants_the_compact_model_alone_gets_the_same_one(inputs, tmp_path):
+def test_whoever_wants_the_compact_model_alone_gets_the_same_one(inputs, tmp_path, caplog):
     asked = replace(STOPPING, early_stop=False)
     for name, config in (("both", asked), ("alone", replace(asked, compact_only=True))):
         summary = run(config, inputs, tmp_path / name)
@@ -230,6 +230,7 @@ def test_whoever_wants_the_compact_model_alone_gets_the_same_one(inputs, tmp_pat
         assert pruned.iterations == 160
     assert (tmp_path / "both-prune" / "splats.ply").read_bytes() == (
         tmp_path / "alone-prune" / "splats.ply").read_bytes()
+    assert_facts(caplog.text, 96, 160, "unfinished")
     given = StageInputs({**given.folders, "prune": tmp_path / "alone-prune"})
     (tmp_path / "scores").mkdir()
     scores = evaluate.run(EvaluateConfig(trust=False), given, tmp_path / "scores", CONTEXT)
