@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 import pytest
 
 from recon_cli.errors import ReconError
+
+Kind = TypeVar("Kind", bound=Exception)
 
 
 def assert_facts(text: str, *facts: object) -> None:
@@ -22,9 +25,12 @@ def assert_facts(text: str, *facts: object) -> None:
 
 
 @contextmanager
-def raises(kind: type[ReconError], *facts: object) -> Iterator[pytest.ExceptionInfo[ReconError]]:
-    """Expects an error that says what to type next and whose message names every fact."""
+def raises(
+    kind: type[Kind] | tuple[type[Kind], ...], *facts: object
+) -> Iterator[pytest.ExceptionInfo[Kind]]:
+    """Expects an error whose message names every fact; a ReconError says what to type next, too."""
     with pytest.raises(kind) as caught:
         yield caught
-    assert caught.value.hint
-    assert_facts(caught.value.message, *facts)
+    if isinstance(caught.value, ReconError):
+        assert caught.value.hint
+    assert_facts(str(caught.value), *facts)

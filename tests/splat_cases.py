@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gzip
 import random
+import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -99,3 +101,22 @@ def read_or_refused(read, path, data: bytes) -> bool:
             return False
     assert all(value.isfinite().all() for value in splats.parameters().values())
     return True
+
+
+def rewritten(
+    path: Path, form: str, kind: str = "float", extra: Sequence[str] = (), tail: bytes = b""
+) -> None:
+    """Writes a .ply of `write_ply` again in another form, with columns before and a tail."""
+    head, data = path.read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[2] for line in head.decode().splitlines() if "property" in line]
+    count = int(re.search(rb"vertex (\d+)", head)[1])
+    table = np.frombuffer(data, "<f4").reshape(count, len(names))
+    table = np.hstack([np.full((count, len(extra)), 7, "f4"), table])
+    lines = ["ply", f"format {form} 1.0", "comment by hand", f"element vertex {count}",
+             *(f"property {kind} {name}" for name in [*extra, *names])]
+    if form == "ascii":
+        body = "".join(" ".join(repr(float(x)) for x in row) + "\n" for row in table).encode()
+    else:
+        order = "<" if "little" in form else ">"
+        body = table.astype(order + {"float": "f4", "double": "f8"}[kind]).tobytes()
+    path.write_bytes("\n".join(lines).encode() + tail.replace(b"BODY", body))

@@ -2,6 +2,7 @@ import ast
 from pathlib import Path
 
 import pytest
+from facts import assert_facts
 
 import recon_cli
 from recon_cli import errors
@@ -12,7 +13,7 @@ PACKAGE = Path(recon_cli.__file__).parent
 
 def test_a_short_list_is_given_in_full_and_a_long_one_with_the_number_of_the_others():
     assert list_names(["a", "b"]) == "a, b"
-    assert list_names(["a", "b", "c"], most=2) == "a, b and 1 more"
+    assert_facts(list_names(["a", "b", "c"], most=2), "a, b", 1)
 
 
 def _find_error_classes() -> dict[str, bool]:

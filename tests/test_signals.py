@@ -8,6 +8,7 @@ import threading
 import time
 
 import pytest
+from facts import assert_facts
 
 from recon_cli import signals
 from recon_cli.errors import ExitCode
@@ -32,7 +33,7 @@ def test_each_signal_interrupts_and_has_the_exit_code_of_a_shell(number):
     finally:
         signal.signal(number, outside)
     assert exit_code(raised.value) == CODES[number]
-    assert "same command again" in describe_end(raised.value)
+    assert_facts(describe_end(raised.value), "again")
 
 
 def test_a_signal_that_is_ignored_stays_so():

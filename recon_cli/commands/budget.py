@@ -58,7 +58,11 @@ def run_within(
     given = merge([explicit_settings(call), call.settings])
     # what contradicts a time, such as a number of steps, is refused before anything runs
     build(TrainConfig, merge([base, {"train": {"minutes": minutes}}, given]))
+    # only the result of pruning is wanted
+    compact = with_prune and bool(given.get("train", {}).get("compact_only"))
     budget = _recorded(call, minutes, inputs)
+    if budget is not None and compact and not budget.prune:
+        budget = dataclasses.replace(budget, train_minutes=None, prune=None)
     estimator = measure_machine(open_job(call).compute.threads or machine.usable_threads())
 
     def left() -> float:
@@ -84,8 +88,7 @@ def run_within(
     _report_frames(workspace, budget, call.deadline.seconds, estimator)
     stages("denoise", "sfm", "place", frames=frames)
     if budget.train_minutes is None:
-        # pruning takes the place of the steps that are left out, where only its result is wanted
-        compact = with_prune and bool(given.get("train", {}).get("compact_only"))
+        # pruning takes the place of the steps that are left out
         pruning = 0.0 if compact else left() * _PRUNE / (1 + _PRUNE)
         prune = compact or (with_prune and pruning >= _LEAST_PRUNING * estimator.slowness)
         seconds = max(left() - pruning * prune, _LEAST_TRAINING * estimator.slowness)

@@ -82,7 +82,7 @@ def convert(
 
     request = ConvertRequest(
         paths[:-1], paths[-1], tuple(map(_read_transform, transforms)), **changes)
-    say(write(request, _context(call)).describe())
+    say(write(request, _context(call, light=not request.reduces)).describe())
 
 
 @verb("info")
@@ -95,7 +95,7 @@ def info(call: Call, paths: tuple[Path, ...], as_json: bool) -> None:
     """Describe splat files: what they hold, and what is wrong with them."""
     from recon_cli.export.describe_file import FileFindings, describe_file
 
-    ctx, found, errors = _context(call), list[FileFindings](), list[ReconError]()
+    ctx, found, errors = _context(call, light=True), list[FileFindings](), list[ReconError]()
     for path in paths:
         try:
             found.append(describe_file(path, ctx))
@@ -132,7 +132,8 @@ def _read_transform(name: str) -> Similarity:
             "column.") from error
 
 
-def _context(call: Call) -> StageContext:
-    from recon_cli.pipeline.execute import render_context
+def _context(call: Call, *, light: bool) -> StageContext:
+    from recon_cli.pipeline.execute import light_context, render_context
 
-    return render_context(layers.build(ComputeConfig, call.settings), TqdmProgress())
+    context = light_context if light else render_context
+    return context(layers.build(ComputeConfig, call.settings), TqdmProgress())

@@ -15,7 +15,7 @@ from recon_cli.commands.options import Call, explicit_settings, pass_call, verb
 from recon_cli.commands.sentences import end_run
 from recon_cli.commands.view import show_training
 from recon_cli.config.export import ExportConfig
-from recon_cli.config.settings import Settings
+from recon_cli.config.settings import Settings, merge
 from recon_cli.config.stages import (
     DenoiseConfig,
     EvaluateConfig,
@@ -85,7 +85,6 @@ def train(call: Call, with_prune: bool, with_view: bool) -> None:
     """Fit Gaussians; denoise and sfm run first where needed."""
     for name in call.settings.get("prune", {}) if not with_prune else ():
         raise click.UsageError(f"--{name.replace('_', '-')} has no effect without --prune.")
-    _check_compact(call, with_prune)
     with show_training(call) if with_view and not call.print_config else nullcontext() as live:
         callbacks = () if live is None else (live,)
         if with_prune:
@@ -196,7 +195,9 @@ def run(
     INPUT is as for `recon ingest`. Without it, the previous input is used. The results are the
     scene (.ply), a page to look around in it (.html), and a report.
     """
-    _check_compact(call, with_prune)
+    given = merge([explicit_settings(call), call.settings])
+    if given.get("train", {}).get("compact_only") and not with_prune:
+        raise click.UsageError("--compact-only needs pruning: leave out --no-prune.")
     stages = [row.name for row in STAGES if with_prune or row.name != "prune"]
     if minutes is not None and not call.print_config:
         from recon_cli.commands.budget import run_within  # imports OpenCV
@@ -219,11 +220,6 @@ def demo(call: Call) -> None:
     stages = [row.name for row in STAGES]
     run_stages(call, "demo", stages, sources=(SAMPLE,), base=_with_page(DEMO, call))
     end_run(open_job(call))
-
-
-def _check_compact(call: Call, with_prune: bool) -> None:
-    if call.settings.get("train", {}).get("compact_only") and not with_prune:
-        raise click.UsageError("--compact-only needs pruning: give --prune.")
 
 
 def _with_page(base: Settings, call: Call) -> Settings:

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit  # scipy.stats takes a second to import
 
 from recon_cli.workspace.summaries import JsonRecord
 
@@ -85,6 +84,8 @@ def paired_t(ours: Sequence[float], theirs: Sequence[float]) -> Interval:
     mean = statistics.fmean(pairs)
     if len(pairs) < 2:
         return Interval(mean, None, None)
+    from scipy.special import stdtrit  # takes half a second; scipy.stats another one
+
     quantile = float(stdtrit(len(pairs) - 1, (1 + CONFIDENCE) / 2))
     half = quantile * statistics.stdev(pairs) / math.sqrt(len(pairs))
     return Interval(mean, mean - half, mean + half)

@@ -45,7 +45,6 @@ CONVENTION_LINES = (  # below tables in Markdown
 EXPLANATION = (  # of all that tables may hold
     f"{CONVENTION_LINES}masks: {MASK_CONVENTION}\npanoramas: {FACES_CONVENTION}\n"
     f"vignette: {VIGNETTE_CONVENTION}")
-ERROR_GAIN = 4  # of images of differences
 _MAX_DB = 100.0  # of equal images, which JSON cannot hold
 _LPIPS_WEIGHTS = "alexnet-owt-7be5be79.pth"  # as torchvision names them: ends in their SHA-256
 _LPIPS_ADDRESS = f"https://download.pytorch.org/models/{_LPIPS_WEIGHTS}"

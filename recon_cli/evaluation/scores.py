@@ -20,6 +20,7 @@ from recon_cli.workspace.summaries import JsonRecord
 _TEX = str.maketrans({
     "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"})
+ERROR_GAIN = 4  # of images of differences
 REFERENCE = "3DGS"  # the recipe of Kerbl et al. 2023
 _VIEW_FIELDS = ("psnr_db", "psnr_8bit_db", "ssim", "ssim_padded", "lpips", "gain_psnr_db")
 

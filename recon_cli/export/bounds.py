@@ -22,6 +22,7 @@ from recon_cli.export.synthetic_cameras import ASSUMED_DB, SelfPsnr
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
+from recon_cli.splats.values import WIDE, find_bulk
 from recon_cli.workspace.summaries import ExportChange
 
 MOST_LOSS_DB = 0.1  # by bounds; more is said
@@ -39,8 +40,6 @@ _TRIES = 4  # each leaves out a quarter of the one before
 # has its middle 3 of its standard deviations (2.4 degrees) farther aside, is nearer by 1 / 1.15.
 _BEHIND = 1.15
 _STEPS = 40  # of bisections: more than the digits of float32
-WIDE = 10.0  # times the size of the bulk: the room is a dot in a viewer that shows all
-_BULK = (0.05, 0.95)  # quantiles along each axis, between which the bulk lies
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +204,7 @@ def describe_loss(changes: Sequence[ExportChange]) -> str:
 def describe_bounds(splats: Splats) -> str:
     """Returns a warning about a scene that reaches much farther than its bulk; else empty."""
     means = splats.means.detach().double().cpu()
-    low, high = find_bulk(means)
+    low, high = find_bulk(means.numpy())
     bulk, alone = float((high - low).max()), _reach(means)
     across = _reach(splats.with_sphere().means.double().cpu())
     if not across > WIDE * bulk or not bulk:
@@ -220,16 +219,9 @@ def describe_bounds(splats: Splats) -> str:
     return text
 
 
-def find_bulk(means: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the lowest and the highest corner [3] of the box that the bulk [N, 3] lies in."""
-    order = means.sort(dim=0).values  # torch.quantile takes 16 million values at most
-    low, high = (order[round(share * (len(means) - 1))] for share in _BULK)
-    return low, high
-
-
 def _reach(means: Tensor) -> float:
     return float((means.amax(dim=0) - means.amin(dim=0)).max())
 
 
-def _corner(corner: Tensor) -> str:
+def _corner(corner: NDArray[np.float64]) -> str:
     return " ".join(f"{value:.4g}" for value in corner.tolist())

@@ -39,7 +39,7 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import EXTENT_SIGMAS, Splats
 from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.scene.train_view import TrainView
-from recon_cli.splats.values import measure_distances, measure_extent
+from recon_cli.splats.values import HUGE, measure_distances, measure_extent
 
 _NEIGHBOURS = 16  # compared with each; a surface around a Gaussian has about six
 _APART = 0.05  # of the scene's radius: 12 cm in a room with a radius of 2.5 m
@@ -48,7 +48,6 @@ _OUTSIDE = 0.005  # of the Gaussians: a group is small, or lies beyond a side of
 _IN_FRONT = 0.5  # of the depth of the surface behind
 _HARM = 3e-4  # of the squared error of all views that it causes: .0013 dB
 _FAINT = 0.1  # opacity; without views only such a large Gaussian counts as haze
-HUGE = 0.1  # of the distance from the middle, at least of the radius
 _WORST = 0.2  # of the greatest harm: the threshold of a round
 _ROUNDS = 12
 
@@ -95,7 +94,8 @@ def drop_floaters_without_views(splats: Splats, room: tuple[list[float], float])
     """
     means, opacities = splats.means.detach().double(), splats.opacities.detach()
     invisible = opacities < ALPHA_MIN
-    away, bulk = measure_distances(means)
+    distances, bulk = measure_distances(means.cpu().numpy())
+    away = torch.from_numpy(distances).to(means.device)
     large = splats.scales.detach().amax(dim=1) > HUGE * away.clamp_min(bulk)
     haze = (opacities < _FAINT) & large & ~invisible
     alone = torch.zeros_like(invisible)

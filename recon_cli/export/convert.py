@@ -12,28 +12,29 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ConfigError, FormatError, InputError, ReconstructionError
-from recon_cli.export.cleanup import drop_floaters_without_views, drop_islands
-from recon_cli.export.reduce import Box, LowerDegrees, crop, fit_to_size, measure_change
 from recon_cli.export.synthetic_cameras import ASSUMED_DB, VIEW_SIZE, SelfPsnr, synthetic_scene
 from recon_cli.export.verify import file_size, measure_size, verify_ply, write_until_good
-from recon_cli.scene.gravity import turn_onto
 from recon_cli.scene.scene import Scene
 from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.splats import Splats, joined, transformed
+from recon_cli.scene.splat_arrays import SplatArrays
 from recon_cli.splats.axes import UP, nearest_up
-from recon_cli.splats.coarsen import coarsen
 from recon_cli.splats.format import LoadedScene, WriteSettings
 from recon_cli.splats.lod import discard_levels
 from recon_cli.splats.registry import FORMATS, check_writable, load_splats
 from recon_cli.workspace import durable
 from recon_cli.workspace.atomic import sync_folder
 from recon_cli.workspace.export_formats import ExportFormat, LossLimit
+
+if TYPE_CHECKING:  # where nothing is reduced, `recon convert` does without torch
+    from recon_cli.export.reduce import Box
+    from recon_cli.scene.splats import Splats
 
 _GUESSED_UP = "-y"  # of a file that does not say, as in viewers
 _NO_VIEWS = (
@@ -61,6 +62,13 @@ class ConvertRequest:
     max_mb: float | None = None
     max_loss: float | None = None  # dB; None for that of the format
     force: bool = False  # an existing file is replaced
+
+    @property
+    def reduces(self) -> bool:
+        """Whether an option removes something."""
+        return self.drop_floaters or self.drop_islands or any(
+            limit is not None
+            for limit in (self.crop, self.sh_degree, self.max_gaussians, self.max_mb))
 
 
 @dataclass(frozen=True)
@@ -95,14 +103,15 @@ def convert(request: ConvertRequest, ctx: StageContext) -> Converted:
     assert settings.up is not None, "of a merged scene it is known, or taken to be -y"
     reducer = _Reducer(whole, settings.up, ctx)
     splats = reducer.reduce(
-        request, lambda changed: measure_size(row, changed, settings))
+        request, lambda changed: measure_size(row, changed, settings)) if request.reduces else whole
     checked = reducer if splats is whole else _Reducer(splats, settings.up, ctx)
     folder = request.out.parent
     with tempfile.TemporaryDirectory(dir=folder, prefix=".recon-convert-") as scratch:
         path = Path(scratch) / request.out.name
         gain = _write(row, path, splats, settings, request, checked)
         # formats hold the backdrop as Gaussians, as many as their greatest scale needs
-        size, count = file_size(row, path), len(FORMATS[row.name].read(path).with_sphere())
+        size = file_size(row, path)
+        count = len(FORMATS[row.name].load(path).arrays.with_sphere())
         if row.name == "lod":
             discard_levels(request.out)
             for part in path.parent.iterdir():
@@ -126,7 +135,7 @@ def _check_out(request: ConvertRequest) -> ExportFormat:
 
 
 def _write(
-    row: ExportFormat, path: Path, splats: Splats, settings: WriteSettings,
+    row: ExportFormat, path: Path, splats: SplatArrays, settings: WriteSettings,
     request: ConvertRequest, reducer: _Reducer,
 ) -> float:
     """Writes and checks a file, and returns its gain in dB; ReconstructionError if it is bad."""
@@ -148,14 +157,16 @@ def _write(
     return gain
 
 
-def _merge(request: ConvertRequest, ctx: StageContext) -> tuple[Splats, WriteSettings]:
+def _merge(
+    request: ConvertRequest, ctx: StageContext
+) -> tuple[SplatArrays, WriteSettings]:
     """Returns the scene of all inputs, each in its place, and the facts that a file can hold.
 
     Up and scale are those of the request. Each position is rounded to float32 once.
     """
     scenes = [load_splats(path) for path in request.inputs]
     for path, scene in zip(request.inputs, scenes, strict=True):
-        if not len(scene.splats):
+        if not len(scene.arrays):
             raise FormatError(f"{path} holds no Gaussians.", hint="Leave it out.")
     transforms = request.transforms or (Similarity(),) * len(scenes)
     # The first far scene that stays where it is takes the origin of the result with it.
@@ -173,15 +184,23 @@ def _merge(request: ConvertRequest, ctx: StageContext) -> tuple[Splats, WriteSet
         x, y, z = origin.point
         world = world.after(_moved((-x, -y, -z)))
     _tell_differences(request.inputs, scenes, ups, ctx)
-    degree = max(scene.splats.sh_degree for scene in scenes)
-    parts = []
-    for scene, similarity in zip(scenes, placed, strict=True):
-        whole = world.after(similarity)
-        part = scene.splats if whole.is_identity else transformed(scene.splats, whole)
-        parts.append(part.with_degree(degree) if part.sh_degree < degree else part)
-    return parts[0] if len(parts) == 1 else joined(parts)[0], WriteSettings(
+    return _join(scenes, [world.after(similarity) for similarity in placed]), WriteSettings(
         up=world.rotation @ ups[0], antialiased=all(scene.antialiased for scene in scenes),
         title=request.out.name)
+
+
+def _join(scenes: Sequence[LoadedScene], similarities: Sequence[Similarity]) -> SplatArrays:
+    """Returns all scenes as one, each in its place."""
+    if len(scenes) == 1 and similarities[0].is_identity:
+        return scenes[0].arrays
+    from recon_cli.scene.splats import joined, transformed
+
+    degree = max(scene.arrays.sh_degree for scene in scenes)
+    parts = []
+    for scene, similarity in zip(scenes, similarities, strict=True):
+        part = scene.splats if similarity.is_identity else transformed(scene.splats, similarity)
+        parts.append(part.with_degree(degree) if part.sh_degree < degree else part)
+    return (parts[0] if len(parts) == 1 else joined(parts)[0]).as_arrays()
 
 
 def _moved(by: tuple[float, float, float]) -> Similarity:
@@ -194,6 +213,8 @@ def _world(
     """Returns the similarity of --scale and --up; `up` [3] is that of the first input."""
     if request.up is None:
         return Similarity(scale=request.scale)
+    from recon_cli.scene.gravity import turn_onto
+
     if not known:
         ctx.notice(f"{request.inputs[0].name} does not say where up is: --up takes {_GUESSED_UP}, "
                    "as viewers do")
@@ -210,7 +231,7 @@ def _tell_differences(
     if marked and len(marked) < len(names):
         ctx.notice(f"trained for antialiased rendering: {', '.join(marked)}; the others were not, "
                    "so the written file does not say it")
-    backdrops = [name for name, scene in zip(names, scenes, strict=True) if scene.splats.backdrop]
+    backdrops = [name for name, scene in zip(names, scenes, strict=True) if scene.arrays.backdrop]
     if len(backdrops) > 1:
         ctx.notice(f"{len(backdrops)} scenes have a backdrop: that of {backdrops[0]} is kept")
     for name, scene, up in zip(names, scenes, ups, strict=True):
@@ -222,7 +243,7 @@ def _tell_differences(
 class _Reducer:
     """A scene with the views that reductions and files of it are judged by."""
 
-    def __init__(self, splats: Splats, up: NDArray[np.float64], ctx: StageContext) -> None:
+    def __init__(self, splats: SplatArrays, up: NDArray[np.float64], ctx: StageContext) -> None:
         self._splats, self._up, self._ctx = splats, up, ctx
 
     @cached_property
@@ -241,17 +262,24 @@ class _Reducer:
         return SelfPsnr.from_renders(
             self._splats, [view.camera for view in self._scene.train], self._ctx)
 
-    def at_degree(self, splats: Splats, degree: int) -> Splats:
+    def at_degree(self, splats: SplatArrays, degree: int) -> SplatArrays:
         """Returns a version of the scene in at most this degree, as the views see it."""
         if degree >= splats.sh_degree:
             return splats
-        cameras = [view.camera for view in self._scene.train]
-        return LowerDegrees(
-            splats, cameras, backend=self._ctx.backend, device=self._ctx.device).at(degree)
+        from recon_cli.export.reduce import LowerDegrees
 
-    def reduce(self, request: ConvertRequest, size_of: Callable[[Splats], int]) -> Splats:
-        """Returns the scene after the options that remove something; the scene itself if none."""
-        splats = self._splats
+        cameras = [view.camera for view in self._scene.train]
+        return LowerDegrees(splats.as_tensors(), cameras, backend=self._ctx.backend,
+                            device=self._ctx.device).at(degree).as_arrays()
+
+    def reduce(
+        self, request: ConvertRequest, size_of: Callable[[Splats], int]
+    ) -> SplatArrays:
+        """Returns the scene after the options that remove something."""
+        from recon_cli.export.cleanup import drop_floaters_without_views, drop_islands
+        from recon_cli.export.reduce import crop, fit_to_size, measure_change
+
+        splats = self._splats.as_tensors()
 
         def step(option: str, after: Splats) -> Splats:
             measure_change(option, splats, after, self.psnr.psnr_db)
@@ -265,16 +293,17 @@ class _Reducer:
         if request.crop is not None:
             splats = step("crop", crop(splats, request.crop))
         if request.sh_degree is not None and request.sh_degree < splats.sh_degree:
-            splats = step("sh_degree", self.at_degree(splats, request.sh_degree))
+            splats = step(
+                "sh_degree", self.at_degree(splats.as_arrays(), request.sh_degree).as_tensors())
         if request.max_gaussians is not None and request.max_gaussians < len(splats):
             splats = step("max_gaussians", _coarsened(splats, request.max_gaussians))
         if request.max_mb is not None:
             whole = splats
             splats = step("max_mb", fit_to_size(
                 splats, int(1e6 * request.max_mb), size_of=size_of, fewer=_coarsened,
-                at_degree=lambda degree: self.at_degree(whole, degree),
+                at_degree=lambda degree: self.at_degree(whole.as_arrays(), degree).as_tensors(),
                 psnr_db=self.psnr.psnr_db))
-        return splats
+        return splats.as_arrays()
 
 
 def _coarsened(splats: Splats, count: int) -> Splats:
@@ -283,4 +312,6 @@ def _coarsened(splats: Splats, count: int) -> Splats:
     Without views, merging neighbours keeps more than dropping those that seem to matter least:
     docs/convert.md.
     """
+    from recon_cli.splats.coarsen import coarsen
+
     return replace(coarsen(splats, count), backdrop=splats.backdrop)

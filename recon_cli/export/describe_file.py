@@ -10,22 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon_cli.context import StageContext
 from recon_cli.errors import FormatError
-from recon_cli.export.bounds import WIDE, find_bulk
-from recon_cli.export.cleanup import HUGE
 from recon_cli.export.synthetic_cameras import VIEW_SIZE, VISIBLE, synthetic_scene
-from recon_cli.render import render
-from recon_cli.scene.splats import Splats
+from recon_cli.render.drawing import draw
+from recon_cli.scene.splat_arrays import SplatArrays
 from recon_cli.splats.axes import UP
 from recon_cli.splats.foreign import FLAT
 from recon_cli.splats.format import LoadedScene
 from recon_cli.splats.registry import format_of, load_splats
-from recon_cli.splats.values import measure_distances
+from recon_cli.splats.values import HUGE, WIDE, find_bulk, lower_median, measure_distances
 
 _TINY = 5e-4  # of the radius: half a pixel in an image 1000 pixels wide, taken from that far
 _FAINT = 0.05  # opacity of nearly transparent ones
@@ -84,27 +80,25 @@ def describe_file(path: Path, ctx: StageContext) -> FileFindings:
     """Returns the facts about a file; FormatError if it is damaged, empty or unknown."""
     with _collected_warnings() as problems:
         scene = load_splats(path)
-    splats = scene.splats
+    splats = scene.arrays
     if not len(splats):
         raise FormatError(f"{path} holds no Gaussians.", hint="Export it again.")
-    means = splats.means.double()
-    away, bulk = measure_distances(means)
-    radius = float(bulk)
-    size = splats.scales.amax(dim=1)
+    means = splats.means.astype(np.float64)
+    away, radius = measure_distances(means)
+    size = splats.scales.max(axis=1)
     low, high = find_bulk(means)
     overdraw = _measure_overdraw(splats, np.array(UP[scene.up or "-y"]), ctx)
-    shift = torch.tensor(
-        scene.origin.point if scene.origin else (0.0, 0.0, 0.0), dtype=torch.float64)
+    shift = np.array(scene.origin.point if scene.origin else (0.0, 0.0, 0.0))
     problems += _find_problems(scene, radius, (low, high), overdraw)
     return FileFindings(
         file=str(path), format=format_of(path).name, bytes=path.stat().st_size,
         gaussians=len(splats.with_sphere()), sh_degree=splats.sh_degree, up=scene.up,
         writer=_printable(scene.writer), antialiased=scene.antialiased,
         backdrop=splats.backdrop is not None,
-        bounds=_corners(means.amin(dim=0) + shift, means.amax(dim=0) + shift),
+        bounds=_corners(means.min(axis=0) + shift, means.max(axis=0) + shift),
         bulk_bounds=_corners(low + shift, high + shift),
-        median_size=float(size.median()), tiny=_share(size < _TINY * radius),
-        huge=_share(size > HUGE * away.clamp_min(radius)),
+        median_size=float(lower_median(size)), tiny=_share(size < _TINY * radius),
+        huge=_share(size > HUGE * np.maximum(away, radius)),
         nearly_transparent=_share(splats.opacities < _FAINT), overdraw=overdraw,
         problems=tuple(_printable(text) for text in problems))
 
@@ -128,26 +122,27 @@ def _collected_warnings() -> Iterator[list[str]]:
 
 
 def _find_problems(
-    scene: LoadedScene, radius: float, bulk: tuple[Tensor, Tensor], overdraw: float | None
+    scene: LoadedScene, radius: float, bulk: tuple[NDArray[np.float64], ...], overdraw: float | None
 ) -> list[str]:
     """Returns one line about each thing that makes trouble in viewers, beside those on reading."""
-    splats, found, count = scene.splats, list[str](), f"{len(scene.splats):,}"
-    means, lengths = splats.means.double(), splats.quats.double().norm(dim=1)
-    flat = int((splats.log_scales <= FLAT + 1e-3).any(dim=1).sum())
+    splats, found, count = scene.arrays, list[str](), f"{len(scene.arrays):,}"
+    means = splats.means.astype(np.float64)
+    flat = int((splats.log_scales <= FLAT + 1e-3).any(axis=1).sum())
     if flat:
         # readers put small values in place of a 0, and trained ones may be as small
         found.append(f"{flat:,} of {count} Gaussians are flat: a scale is at most "
                      f"{math.exp(FLAT):.0e} units")
-    none = int((lengths == 0).sum())  # other lengths than 1 are usual, and every viewer mends them
+    # other lengths than 1 are usual, and every viewer mends them
+    none = int((~splats.quats.any(axis=1)).sum())
     if none:
         found.append(f"{none:,} of {count} rotations are 0 0 0 0, which some viewers do not draw")
     if scene.origin is not None:
         found.append(scene.origin.describe())
-    middle = float(means.median(dim=0).values.norm())
+    middle = float(np.linalg.norm(lower_median(means)))
     if scene.origin is None and radius and middle > _FAR * radius:
         found.append(f"everything is far away: {middle:.4g} units from the origin, where the scene "
                      f"has a radius of {radius:.4g}; viewers that turn about the origin miss it")
-    across = float((means.amax(dim=0) - means.amin(dim=0)).max())
+    across = float(np.ptp(means, axis=0).max())
     if across > WIDE * float((bulk[1] - bulk[0]).max()) > 0:
         found.append(f"it is {across:.4g} units across, but nine tenths of the Gaussians lie in a "
                      "small part of that: viewers that fit all start far away")
@@ -159,25 +154,23 @@ def _find_problems(
 
 
 def _measure_overdraw(
-    splats: Splats, up: NDArray[np.float64], ctx: StageContext
+    splats: SplatArrays, up: NDArray[np.float64], ctx: StageContext
 ) -> float | None:
     """Returns how many Gaussians contribute to a covered pixel of synthetic views, on the mean."""
-    on_device = splats.map(lambda tensor: tensor.to(ctx.device))
     hits = pixels = 0
     for view in synthetic_scene(splats, up=up, max_size=VIEW_SIZE).train:
-        with torch.no_grad():
-            output = render(on_device, view.camera, on_device.background, 0, backend=ctx.backend,
-                            scores=True)
-        hits += int(output.statistics.hits.sum())
-        pixels += int((output.alpha > VISIBLE).sum())
+        drawing = draw(splats, view.camera, 0, backend=ctx.backend, device=ctx.device,
+                       count=True)
+        hits += drawing.hits
+        pixels += int((drawing.alpha > np.float32(VISIBLE)).sum())
     return hits / pixels if pixels else None
 
 
-def _share(mask: Tensor) -> float:
-    return float(mask.double().mean())
+def _share(mask: NDArray[np.bool_]) -> float:
+    return float(mask.mean())
 
 
-def _corners(low: Tensor, high: Tensor) -> tuple[Corner, Corner]:
+def _corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Corner, Corner]:
     return low.tolist(), high.tolist()
 
 

@@ -5,21 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from recon_cli.context import StageContext
 from recon_cli.errors import ReconstructionError
-from recon_cli.evaluation.reference_views import render_view
 from recon_cli.render.contract import NEAR
+from recon_cli.render.drawing import draw
 from recon_cli.scene.camera import Camera, looking_at
 from recon_cli.scene.scene import Scene, View
-from recon_cli.scene.splats import EXTENT_SIGMAS, Splats
+from recon_cli.scene.splat_arrays import EXTENT_SIGMAS, SplatArrays
 from recon_cli.scene.statistics import FINE_SAMPLE
 from recon_cli.splats.ply import MIN_OPACITY
-from recon_cli.splats.values import measure_extent
+from recon_cli.splats.values import lower_median, measure_extent
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
 
 VIEW_SIZE = 600  # pixels, longest side of the renders that a file is checked on
 CAMERAS_AROUND = 4  # cameras outside, and as many inside
@@ -28,6 +31,7 @@ _DISTANCE = 2.5  # radii: the bulk and some space around it fill a field of view
 _HEIGHT = 0.6  # radii, of the cameras outside
 _INSIDE = 0.6  # radii from the middle, within which the emptiest position is searched
 _CANDIDATES = 1000
+_BOUNDING = 1000  # Gaussians, at least, whose distances bound those of candidates
 VISIBLE = 0.5 / 255  # coverage that changes an 8-bit image
 _FOV_DEG = 60.0
 _ASPECT = 1.5
@@ -37,7 +41,7 @@ ASSUMED_DB = 30.0
 
 
 def synthetic_scene(
-    splats: Splats, *, up: NDArray[np.float64], max_size: int
+    splats: Splats | SplatArrays, *, up: NDArray[np.float64], max_size: int
 ) -> Scene:
     """Returns a scene whose training views are cameras without images; deterministic.
 
@@ -45,11 +49,13 @@ def synthetic_scene(
     four stand where there is most space inside and look outward. `up` is a unit vector [3] along z
     or y; `max_size` is the longest side in pixels.
     """
-    opaque = splats.opacities >= MIN_OPACITY
-    used = opaque if bool(opaque.any()) else ~opaque
-    means = splats.means[used].double().cpu().numpy()
+    arrays = splats.as_arrays()
+    opaque = arrays.opacities >= MIN_OPACITY
+    used = opaque if opaque.any() else ~opaque
+    means = arrays.means[used].astype(np.float64)
     middle, bulk = measure_extent(means)
-    size = float(splats.scales[used].amax(dim=1).double().median())  # centres alone may all be one
+    # centres alone may all be one
+    size = float(lower_median(arrays.scales[used].max(axis=1).astype(np.float64)))
     radius = max(bulk, EXTENT_SIGMAS * size, _LEAST_RADIUS)
     x_axis = np.array([1.0, 0, 0])
     y_axis = np.cross(up, x_axis)
@@ -78,8 +84,19 @@ def _find_emptiest(
     ways = rng.standard_normal((_CANDIDATES, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     positions = middle + within * np.cbrt(rng.random((_CANDIDATES, 1))) * ways
-    clearance, _ = cKDTree(means).query(positions)
-    return np.asarray(positions[np.argmax(clearance)])
+    # No tree, whose package takes half a second: the distance to some bounds that to all, and few
+    # positions are left that may be better than the best so far.
+    bounds = np.full(len(positions), np.inf)
+    for mean in means[:: max(1, len(means) // _BOUNDING)]:
+        np.minimum(bounds, ((positions - mean) ** 2).sum(axis=1), out=bounds)
+    best, place = -1.0, 0
+    for at in np.argsort(-bounds, kind="stable"):
+        if bounds[at] <= best:
+            break
+        clearance = float(((means - positions[at]) ** 2).sum(axis=1).min())
+        if clearance > best:
+            best, place = clearance, int(at)
+    return np.asarray(positions[place])
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +112,9 @@ class SelfPsnr:
     ctx: StageContext  # backend and device
 
     @staticmethod
-    def from_renders(splats: Splats, cameras: Sequence[Camera], ctx: StageContext) -> SelfPsnr:
+    def from_renders(
+        splats: Splats | SplatArrays, cameras: Sequence[Camera], ctx: StageContext
+    ) -> SelfPsnr:
         """Renders `splats` at the cameras; ReconstructionError if none sees anything."""
         renders = [(camera, *_render(splats, camera, ctx)) for camera in cameras]
         views = tuple(view for view in renders if view[2].any())
@@ -111,7 +130,7 @@ class SelfPsnr:
         return (f"{len(self.views)} synthetic cameras, against renders of the scene itself, as if "
                 f"it showed photos at {ASSUMED_DB:g} dB")
 
-    def psnr_db(self, splats: Splats) -> float:
+    def psnr_db(self, splats: Splats | SplatArrays) -> float:
         """Returns the mean over the cameras in dB, at most ASSUMED_DB."""
         values = []
         for camera, before, visible in self.views:
@@ -122,11 +141,8 @@ class SelfPsnr:
 
 
 def _render(
-    splats: Splats, camera: Camera, ctx: StageContext
+    splats: Splats | SplatArrays, camera: Camera, ctx: StageContext
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Returns an image [H, W, 3], and where it shows something [H, W]."""
-    on_device = splats.map(lambda tensor: tensor.to(ctx.device))
-    output = render_view(on_device, camera, on_device.sh_degree, ctx.backend)
-    image: NDArray[np.float32] = output.rgb.clamp(0, 1).cpu().numpy()
-    visible: NDArray[np.bool_] = (output.alpha > VISIBLE).cpu().numpy()
-    return image, visible
+    drawing = draw(splats, camera, splats.sh_degree, backend=ctx.backend, device=ctx.device)
+    return drawing.rgb.clip(0, 1), drawing.alpha > np.float32(VISIBLE)

@@ -7,7 +7,7 @@ import shutil
 import struct
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,14 @@ from PIL import Image, UnidentifiedImageError
 
 from recon_cli.errors import FormatError, Hint, InputError
 from recon_cli.io.calibration import rotation_matrix
-from recon_cli.io.colmap_library import pycolmap, write_model
 from recon_cli.io.face_frames import read_face_frames
 from recon_cli.scene.camera import MODELS, Camera, Lens, make_lens
-from recon_cli.scene.covisibility import Observations
 from recon_cli.scene.scene import Scene, View, split_views
 from recon_cli.workspace.paths import refuse_special
+
+if TYPE_CHECKING:  # readers need neither pycolmap nor SciPy
+    from recon_cli.io.colmap_library import pycolmap
+    from recon_cli.scene.covisibility import Observations
 
 # COLMAP's camera models by their ids, src/colmap/sensor/models.h and pycolmap 4.2's CameraModelId
 _MODELS = (
@@ -150,6 +152,8 @@ def read_observations(
     views = np.array([rows[number] for _, track in points for number in track], np.int64)
     point = np.repeat(np.arange(len(points)), [len(track) for _, track in points])
     positions = np.array([row[1:4] for row, _ in points], np.float64).reshape(-1, 3)
+    from recon_cli.scene.covisibility import Observations
+
     return sorted(names.values()), positions, Observations(views, point, len(names), len(points))
 
 
@@ -186,6 +190,8 @@ def write_part(
 
     Points count in the order of their ids, as in `read_points`. Returns how many were written.
     """
+    from recon_cli.io.colmap_library import pycolmap, write_model
+
     model = pycolmap.Reconstruction(sparse)
     keep = dict(zip(sorted(model.points3D), points.tolist(), strict=True))
     tracked = model.compute_num_observations() > 0
@@ -230,6 +236,8 @@ def write_colmap(
         raise InputError("There are no cameras to write.", hint=Hint("sfm", then=" first"))
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder} is not empty.", hint="Name another folder, or remove it.")
+    from recon_cli.io.colmap_library import pycolmap, write_model
+
     model = _model(views)
     for point, color in zip(points, colors, strict=True):
         model.add_point3D(point, pycolmap.Track(), color)
@@ -253,6 +261,8 @@ def write_priors(
     `deviation` is the standard deviation of a place in world units; None leaves it to COLMAP.
     Gravity points down and is in the axes of the camera. Views are as in `write_colmap`.
     """
+    from recon_cli.io.colmap_library import pycolmap
+
     model = _model(views)
     partial = path.with_name(f".{path.name}.tmp{os.getpid()}")
     partial.unlink(missing_ok=True)
@@ -275,6 +285,8 @@ def write_priors(
 def _prior(
     data_id: Any, camera: Camera, deviation: float | None, up: NDArray[np.float64] | None
 ) -> pycolmap.PosePrior:
+    from recon_cli.io.colmap_library import pycolmap
+
     prior = pycolmap.PosePrior()
     prior.corr_data_id = data_id
     prior.position = camera.center
@@ -287,6 +299,8 @@ def _prior(
 
 
 def _model(views: Sequence[tuple[str, Camera]]) -> pycolmap.Reconstruction:
+    from recon_cli.io.colmap_library import pycolmap
+
     model, ids = pycolmap.Reconstruction(), dict[tuple[float, ...], int]()
     for number, (name, camera) in enumerate(views, start=1):
         inner = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)

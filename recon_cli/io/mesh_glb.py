@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from recon_cli.io.images import encode_image
@@ -38,6 +37,8 @@ def glb_bytes(mesh: Mesh, tint: tuple[float, float, float] | None) -> bytes:
     Inferred surface is a mesh of its own with the material `inferred`, whose colour is `tint` if
     given, and its vertices have the attribute `_INFERRED` of 1.
     """
+    import trimesh
+
     scene = trimesh.Scene()
     names = []
     for name, part in mesh.parts():

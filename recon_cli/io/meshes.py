@@ -7,11 +7,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.colmap_library import pycolmap
 from recon_cli.io.mesh_data import TINT, Mesh, Texture
 from recon_cli.io.mesh_glb import glb_bytes, read_glb
 from recon_cli.io.mesh_obj import read_obj, write_obj
@@ -46,6 +44,8 @@ def write_mesh(
 
 
 def _ply_bytes(mesh: Mesh, tint: bool) -> bytes:
+    import trimesh  # half a second, and more with SciPy
+
     colors = mesh.colors
     if mesh.inferred is not None and tint:
         colors = np.where(
@@ -61,6 +61,8 @@ def write_point_cloud(
     path: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]
 ) -> None:
     """Writes points [P, 3] with RGB colours [P, 3] as a .ply, atomically."""
+    import trimesh
+
     write_bytes(path, trimesh.PointCloud(points.astype(np.float32), colors).export(file_type="ply"))
 
 
@@ -78,6 +80,8 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def _read_ply(path: Path) -> Mesh:
+    import trimesh
+
     mesh = trimesh.load_mesh(str(path), process=False)
     marks = mesh.metadata["_ply_raw"]["vertex"]["data"]
     return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64),
@@ -94,6 +98,10 @@ def simplify(
     """
     if len(faces) <= most:
         return vertices, faces
+    import trimesh
+
+    from recon_cli.io.colmap_library import pycolmap
+
     with tempfile.TemporaryDirectory(prefix="recon-mesh-") as folder:
         before, after = os.path.join(folder, "before.ply"), os.path.join(folder, "after.ply")
         middle = vertices.mean(axis=0)  # float32 keeps more digits near the origin

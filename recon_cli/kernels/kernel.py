@@ -17,7 +17,8 @@ import pickle
 import platform
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -32,9 +33,11 @@ from recon_cli import machine
 
 logger = logging.getLogger("recon")
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+_OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False, "no_cfunc_wrapper": True}
 Compiled = Callable[..., Any]
 CODE = ".nbc"  # end of the name of a file of machine code
+READY = "ready"  # file in the cache folder once every kernel is there
+_SCIPY = "scipy.linalg"
 unsaved: list[OSError] = []  # why kernels were not kept
 
 
@@ -103,7 +106,8 @@ def _save(save: Callable[..., None], signature: Any, machine_code: Any) -> None:
 
 def inlined(function: Compiled) -> Compiled:
     """Compiles a function into every kernel that calls it."""
-    return numba.njit(**_OPTIONS, forceinline=True)(function)  # type: ignore[no-any-return]
+    return numba.njit(  # type: ignore[no-any-return]
+        **_OPTIONS, forceinline=True, no_cpython_wrapper=True)(function)
 
 
 @cache
@@ -126,6 +130,25 @@ def cache_folder() -> Path | None:
             "RECON_CACHE_DIR to a folder of your own.", folder)
         return None
     return folder
+
+
+def is_warm() -> bool:
+    """Tells whether machine code for this CPU is there."""
+    folder = cache_folder()
+    return folder is not None and (folder / READY).exists()
+
+
+@contextmanager
+def without_scipy() -> Iterator[None]:
+    """Keeps numba from importing scipy.linalg, slowly, for a BLAS that no kernel needs."""
+    if _SCIPY in sys.modules:
+        yield
+        return
+    sys.modules[_SCIPY] = None  # type: ignore[assignment]  # an import of it fails at once
+    try:
+        yield
+    finally:
+        del sys.modules[_SCIPY]
 
 
 def fingerprint() -> str:

@@ -274,7 +274,8 @@ def _flat(array: Any, dtype: Any, index: Any) -> bool:
 
 def _address(context: Any, builder: Any, sig: Any, args: Any, first: int = 0) -> Any:
     """Returns the address of array[index], two operands from number `first` on."""
-    data = context.make_array(sig.args[first])(context, builder, value=args[first]).data
+    # the pointer alone: a proxy of the array would write all its fields to the stack
+    data = context.data_model_manager[sig.args[first]].get(builder, args[first], "data")
     index = context.cast(builder, args[first + 1], sig.args[first + 1], types.int64)
     return builder.gep(data, [index])
 

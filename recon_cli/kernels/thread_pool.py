@@ -15,7 +15,6 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 AT_ONCE = 128  # rows, triangles or blocks that a thread takes at a time
@@ -47,7 +46,11 @@ class ThreadPool:
     @property
     def size(self) -> int:
         """How many threads run a kernel."""
-        return self.threads or torch.get_num_threads()
+        if self.threads:
+            return self.threads
+        import torch
+
+        return torch.get_num_threads()
 
     def run(self, kernel: Kernel, *arguments: Any, scratch: bool = True) -> None:
         """Calls kernel(counter, *arguments, scratch) in every thread and waits for all.

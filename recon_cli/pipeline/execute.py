@@ -261,6 +261,17 @@ def render_context(compute: ComputeConfig, progress: Progress) -> StageContext:
     return StageContext(progress, device, backend, threads, max_memory_bytes=most)
 
 
+def light_context(compute: ComputeConfig, progress: Progress) -> StageContext:
+    """Returns where to draw a few views: with numba without torch, if that may be and is ready."""
+    from recon_cli.render import drawing  # imports numpy
+
+    threads = compute.threads or machine.usable_threads()
+    if (compute.backend in ("auto", "numba") and compute.device in ("auto", "cpu")
+            and drawing.use_kernels(threads)):
+        return StageContext(progress, "cpu", "numba", threads)
+    return render_context(compute, progress)
+
+
 def _prepare_kernels(progress: Progress, backend: str) -> None:
     """Loads the kernels of a backend; shows a bar where they must be compiled first."""
     from recon_cli.render import registry  # imports torch

@@ -9,16 +9,18 @@ autograd in every raw parameter and bit-deterministic on one machine.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from recon_cli.render.response import Response
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+
+if TYPE_CHECKING:  # kernels read the constants, and draw, without torch
+    from torch import Tensor
+
+    from recon_cli.render.response import Response
+    from recon_cli.scene.splats import Splats
 
 TILE = 16  # pixels; the tile of the paper and of INRIA's rasterizer
 ALPHA_MIN = 1.0 / 255.0  # a fragment below one 8-bit step is ignored
@@ -74,6 +76,8 @@ class Statistics:
     @staticmethod
     def zeros(like: Tensor) -> Statistics:
         """Returns empty statistics for the N Gaussians whose means are `like`, [N, 3]."""
+        import torch
+
         n = like.shape[0]
         step = -(-n // _ALIGNED) * _ALIGNED
         zeros = like.new_zeros(7 * step)  # at once: on a GPU each of them would be a launch
@@ -141,6 +145,8 @@ def check_inputs(
     splats: Splats, camera: Camera, background: Tensor, sh_degree: int, mask: Tensor | None
 ) -> None:
     """Raises ValueError where a shape, dtype, device or degree breaks the contract."""
+    import torch
+
     if tuple(background.shape) != (3,):
         raise ValueError(f"background has shape {tuple(background.shape)}, needed (3,)")
     if background.dtype != splats.means.dtype or background.device != splats.means.device:

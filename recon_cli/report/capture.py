@@ -27,7 +27,7 @@ from recon_cli.report.records import read_regions
 from recon_cli.report.stage_status import StageReports
 from recon_cli.scene.gravity import find_gravity, mean_up
 from recon_cli.scene.scene import Scene, View, views_ahead
-from recon_cli.trust.poorly_seen import PoorlySeenRegion
+from recon_cli.trust.records import PoorlySeenRegion
 from recon_cli.workspace.records import FOLDER, Frame, describe_stretches, read_frame_list
 from recon_cli.workspace.summaries import PlaceSummary
 

@@ -6,6 +6,7 @@ Pictures are WebP in data URIs of one HTML file; sizes and then qualities shrink
 from __future__ import annotations
 
 import base64
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,11 +17,11 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
+from PIL import Image
 
 from recon_cli.errors import FormatError
-from recon_cli.evaluation.metrics import ERROR_GAIN
-from recon_cli.evaluation.scores import Metrics, ViewScore
-from recon_cli.io.images import encode_image, fit_image, fit_size, read_png
+from recon_cli.evaluation.scores import ERROR_GAIN, Metrics, ViewScore
+from recon_cli.io.images import fit_image, fit_size, read_png
 from recon_cli.progress import NullProgress, Progress
 
 MAX_FILE_BYTES = 15_000_000
@@ -43,6 +44,8 @@ ENCODINGS = (
 THUMB, MOST_THUMBS = Encoding(480, 72), 8  # beside a text, and how many a section shows
 _SHEET = Encoding(2000, 80)  # as ingest draws it, so that its captions can be read
 _SHEET_BYTES = 900_000
+# Of WebP, 0 to 6: the default, 4, takes twice as long for 3% less bytes and .5 dB of 41
+_METHOD = 2
 _SAMPLE = 3  # views whose size is taken for that of all
 _SAFE = 0.92  # of the budget that an estimate may fill
 
@@ -216,7 +219,9 @@ def read_picture(path: Path, encoding: Encoding = THUMB) -> Markup:
 
 def data_uri(image: NDArray[np.uint8], quality: int) -> Markup:
     """Returns RGB pixels [H, W, 3] as a data URI of WebP."""
-    return embed(encode_image(image, "webp", cv2.IMWRITE_WEBP_QUALITY, quality), "webp")
+    data = io.BytesIO()
+    Image.fromarray(image).save(data, "WEBP", quality=quality, method=_METHOD)
+    return embed(data.getvalue(), "webp")
 
 
 def embed(picture: bytes, kind: str) -> Markup:

@@ -13,7 +13,7 @@ from recon_cli.progress import format_duration, format_megabytes
 from recon_cli.report.records import BASE, PRUNED
 from recon_cli.report.stage_status import StageReport, StageReports
 from recon_cli.trust.quality import delivered_model, find_doubtful_cameras
-from recon_cli.trust.scene_trust import TrustRecord
+from recon_cli.trust.records import TrustRecord
 from recon_cli.workspace.summaries import IngestSummary, PlaceSummary, PruneSummary, TrainSummary
 
 _KINDS = {

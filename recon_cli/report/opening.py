@@ -17,7 +17,7 @@ from recon_cli.report.records import read_trust_record
 from recon_cli.report.stage_status import StageReport, StageReports
 from recon_cli.splats.html import find_title
 from recon_cli.trust.quality import Quality, delivered_model, describe_quality, name_view
-from recon_cli.trust.scene_trust import TrustRecord
+from recon_cli.trust.records import TrustRecord
 from recon_cli.workspace.export_formats import EXPORT_FORMATS
 from recon_cli.workspace.records import FOLDER, Frame, read_frame_list
 from recon_cli.workspace.summaries import ExportedFile, ExportSummary, PlaceSummary

@@ -24,8 +24,7 @@ from recon_cli.evaluation.scores import (
     or_dash,
     view_table,
 )
-from recon_cli.trust.poorly_seen import PoorlySeenRegion
-from recon_cli.trust.scene_trust import TrustRecord
+from recon_cli.trust.records import PoorlySeenRegion, TrustRecord
 from recon_cli.workspace.summaries import LogRow
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ from markupsafe import Markup
 from recon_cli.errors import FormatError
 from recon_cli.report.gallery import embed
 from recon_cli.report.stage_status import StageReport
-from recon_cli.room.files import MEASURES
 from recon_cli.workspace.atomic import read_bytes, read_json
-from recon_cli.workspace.export_formats import PLAN
+from recon_cli.workspace.export_formats import MEASURES, PLAN
 
 _MOST_BYTES = 3_000_000  # of a plan; the page has a limit of its own
 

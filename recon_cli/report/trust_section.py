@@ -16,8 +16,7 @@ from recon_cli.report.records import MODELS, read_trust_record
 from recon_cli.report.stage_status import StageReports
 from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.trust.heat_map import INVENTED, TRUSTED, legend_stops
-from recon_cli.trust.scene_trust import FOLDER, ModelTrust
-from recon_cli.trust.surface import MIN_SPAN_DEG
+from recon_cli.trust.records import FOLDER, MIN_SPAN_DEG, ModelTrust
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from recon_cli.room.plan_svg import describe, draw_plan
 from recon_cli.scene.statistics import ROUNDING
 from recon_cli.splats.glb import nearest_axes
 from recon_cli.workspace.atomic import write_bytes, write_json
-
-MEASURES = "measures.json"
+from recon_cli.workspace.export_formats import MEASURES
 
 logger = logging.getLogger("recon")
 

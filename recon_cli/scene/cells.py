@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +22,8 @@ class Cell:
 
     @cached_property
     def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree  # half a second, which a scene without cells saves
+
         return cKDTree(self.points)
 
     def owns(self, positions: NDArray[np.floating]) -> NDArray[np.bool_]:  # [N, 3] -> [N]

@@ -15,12 +15,12 @@ from torch import Tensor
 from recon_cli.scene.backdrop import SPHERE_OPACITY, Backdrop, enclosing
 from recon_cli.scene.harmonics import rotate_sh
 from recon_cli.scene.similarity import Similarity
-
-SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant basis function
-EXTENT_SIGMAS = 3.0  # standard deviations of a Gaussian within which nearly all of it lies
-LEAST_OPACITY = 1e-6  # far below 1/255, and its logit is finite in float32
-MOST_OPACITY = 0.999  # likewise
-TERMS = (0, 3, 8, 15)  # coefficients a channel after the constant one, by degree
+from recon_cli.scene.splat_arrays import EXTENT_SIGMAS as EXTENT_SIGMAS
+from recon_cli.scene.splat_arrays import LEAST_OPACITY as LEAST_OPACITY
+from recon_cli.scene.splat_arrays import MOST_OPACITY as MOST_OPACITY
+from recon_cli.scene.splat_arrays import SH_C0 as SH_C0
+from recon_cli.scene.splat_arrays import TERMS as TERMS
+from recon_cli.scene.splat_arrays import SplatArrays
 
 
 @dataclass(eq=False)
@@ -73,6 +73,15 @@ class Splats:
     def parameters(self) -> dict[str, Tensor]:
         """Returns the raw parameters by name, in declaration order; no copies."""
         return {name: getattr(self, name) for name in PARAMETERS}
+
+    def as_arrays(self) -> SplatArrays:
+        """Returns the raw parameters as float32 arrays, detached and on the CPU."""
+        return SplatArrays(*(value.detach().cpu().float().numpy()
+                             for value in self.parameters().values()), backdrop=self.backdrop)
+
+    def as_tensors(self) -> Self:
+        """Returns the same, as `SplatArrays.as_tensors` does of arrays."""
+        return self
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """Returns splats whose every parameter went through `change`."""

@@ -8,20 +8,21 @@ Only signs change. The numbers are those of the extension 0xADBE0003 of SPZ
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from recon_cli.scene.harmonics import basis_rest
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splat_arrays import SplatArrays
 
 # By number, from 1 on, as of its release 3; drafts had the last eight in another order.
 AXES = ("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf",
         "lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu")
 PLY, Z_UP = "rdf", "rfu"
+# The axes in which the terms of degrees 1 to 3 are odd: as many factors of a mirrored one as -1.
+_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 # Unit vectors of the axes that can be up in a file, by name.
 UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0), "y": (0.0, 1.0, 0.0)}
 
@@ -47,7 +48,7 @@ def up_of(axes: str) -> str:
     return "-y" if axes[1] in "du" else "z"
 
 
-def turn_from(axes: str, splats: Splats) -> Splats:
+def turn_from(axes: str, splats: SplatArrays) -> SplatArrays:
     """Returns Gaussians of a file with these axes in "rdf", or "rfu" if their up is along z."""
     return flip(splats, signs(axes))
 
@@ -58,16 +59,16 @@ def signs(axes: str) -> list[int]:
     return [1 if theirs == own else -1 for theirs, own in zip(axes, ours, strict=True)]
 
 
-def flip(splats: Splats, signs: list[int]) -> Splats:
+def flip(splats: SplatArrays, signs: list[int]) -> SplatArrays:
     """Returns the Gaussians with each axis times a sign [3], without rounding."""
     if signs == [1, 1, 1]:
         return splats
     x, y, z = signs
-    factors = splats.means.new_tensor(signs)
-    direction = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)  # where no basis function is 0
-    parity = (basis_rest(direction * factors.double(), 3) / basis_rest(direction, 3)).round()
+    of_axis = dict(zip("xyz", signs, strict=True))
+    parity = [math.prod(of_axis[name] for name in odd) for odd in _ODD]
     return replace(
-        splats, means=splats.means * factors,
-        sh_rest=splats.sh_rest * parity[:splats.sh_rest.shape[1], None].to(splats.means),
+        splats, means=splats.means * np.array(signs, np.float32),
+        sh_rest=splats.sh_rest * np.array(
+            parity[:splats.sh_rest.shape[1]], np.float32)[:, None],
         # an axial vector: mirroring one axis turns the other way about the other two
-        quats=splats.quats * splats.quats.new_tensor([1, y * z, x * z, x * y]))
+        quats=splats.quats * np.array([1, y * z, x * z, x * y], np.float32))

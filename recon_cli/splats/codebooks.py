@@ -8,15 +8,16 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2, vq
 
 from recon_cli.splats.values import Floats
 
 BOOK = 256  # values of a byte
-_SAMPLE = 1 << 16  # numbers or rows that centres are fitted to; more change nothing
+_SAMPLE = 1 << 16  # numbers that a codebook is fitted to; more change nothing
+# Rows that a group is fitted to, on the mean: their mean errs by a 64th of the group's own spread.
+_ROWS_A_GROUP = 64
 _PAIRS = 1 << 26  # of rows and centres that are compared at a time: 256 MB
 _BOOK_ROUNDS = 20
-_ROUNDS = 10
+_ROUNDS = 4  # 10 leave 1% less squared error, and take twice as long
 _Float = TypeVar("_Float", np.float32, np.float64)
 
 
@@ -49,9 +50,14 @@ def fit_palette(
     Two levels of k-means: about sqrt(size) groups first, then each by itself, with a share of the
     palette in proportion to its squared error. Duplicate rows count once; `rng` draws the starts.
     """
-    rows, copies = np.unique(rows, axis=0, return_inverse=True)
+    # as texts of bytes: six times as fast as by axis=0
+    texts = np.ascontiguousarray(rows + np.float32(0)).view(f"S{rows.shape[1] * rows.itemsize}")
+    _, first, copies = np.unique(texts, return_index=True, return_inverse=True)
+    rows = rows[first]
     peak = max(float(np.abs(rows).max()), float(np.finfo(np.float32).tiny))
     rows = rows / np.float32(peak)  # so that no square overflows
+    from scipy.cluster.vq import vq  # half a second, which reading does not need
+
     groups, errors = _group_rows(rows, max(1, round(math.sqrt(size))), rng)
     shares = errors / max(errors.sum(), np.finfo(np.float64).tiny)
     spare = size - len(shares)
@@ -64,7 +70,8 @@ def fit_palette(
             continue
         wanted = min(1 + int(share * spare), max(1, _PAIRS // len(members)))
         centres = _lloyd(rows[members], _choose_starts(rows[members], wanted, rng), _ROUNDS)
-        used, own = np.unique(vq(rows[members], centres)[0], return_inverse=True)
+        nearest, _ = vq(rows[members], centres, check_finite=False)
+        used, own = np.unique(nearest, return_inverse=True)
         entries.append(centres[used])
         labels[members] = total + own
         total += len(used)
@@ -75,10 +82,13 @@ def _group_rows(
     rows: Floats, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Returns the group of each row [M] and the squared error of each group."""
-    sample = rows if len(rows) <= _SAMPLE else rows[
-        np.sort(rng.choice(len(rows), _SAMPLE, replace=False))]
+    from scipy.cluster.vq import vq
+
+    sample = rows[np.sort(
+        rng.choice(len(rows), min(len(rows), count * _ROWS_A_GROUP), replace=False))]
     centres = _lloyd(sample, _choose_starts(sample, count, rng), _ROUNDS)
-    parts = [vq(rows[at:at + _SAMPLE], centres) for at in range(0, len(rows), _SAMPLE)]
+    parts = [vq(rows[at:at + _SAMPLE], centres, check_finite=False)
+             for at in range(0, len(rows), _SAMPLE)]
     groups = np.concatenate([part[0] for part in parts]).astype(np.int64)
     squares = np.concatenate([part[1] for part in parts]).astype(np.float64) ** 2
     return groups, np.bincount(groups, squares, len(centres)).astype(np.float64)
@@ -109,7 +119,10 @@ def fit_centres_on_line(
 
 
 def _lloyd(rows: NDArray[_Float], start: NDArray[_Float], rounds: int) -> NDArray[_Float]:
+    from scipy.cluster.vq import kmeans2
+
     with warnings.catch_warnings():  # a centre without rows keeps its value
         warnings.simplefilter("ignore", UserWarning)
-        centres, _ = kmeans2(rows, start, iter=rounds, minit="matrix", missing="warn")
+        centres, _ = kmeans2(
+            rows, start, iter=rounds, minit="matrix", missing="warn", check_finite=False)
     return np.asarray(centres, rows.dtype)

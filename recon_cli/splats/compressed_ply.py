@@ -11,16 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.io.views import evenly_spread
 from recon_cli.scene.backdrop import AT_ONCE
-from recon_cli.scene.harmonics import basis_rest
-from recon_cli.scene.splats import SH_C0, TERMS, Splats
+from recon_cli.scene.splat_arrays import SH_C0, TERMS, SplatArrays
 from recon_cli.splats.foreign import count_terms, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat, WriteSettings
 from recon_cli.splats.ply import describe_settings, describe_writer, is_antialiased, read_up
@@ -39,6 +37,9 @@ from recon_cli.splats.values import (
 )
 from recon_cli.workspace.atomic import replacing
 
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
+
 _AXES, _COLORS = ("x", "y", "z"), ("r", "g", "b")
 _PLACE = [f"{end}_{axis}" for end in ("min", "max") for axis in _AXES]
 _SCALE = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in _AXES]
@@ -54,7 +55,7 @@ Words = NDArray[np.uint32]
 
 
 def write_compressed_ply(
-    path: Path, splats: Splats, *, centers: NDArray[np.float64] | None = None,
+    path: Path, splats: Splats | SplatArrays, *, centers: NDArray[np.float64] | None = None,
     comments: Sequence[str] = (),
 ) -> None:
     """Writes `splats` to `path`, whole or not at all, in Morton order, so that chunks are compact.
@@ -143,6 +144,10 @@ def _harmonic_bytes(sh_rest: Floats) -> Bytes:
 
 def _mean_change(means: Floats, sh_rest: Floats, centers: NDArray[np.float64]) -> Floats:
     """Returns the mean [N, 3] over the centers of the colour that coefficients [N, T, 3] add."""
+    import torch
+
+    from recon_cli.scene.harmonics import basis_rest
+
     degree = TERMS.index(sh_rest.shape[1])
     places, rest = torch.from_numpy(means), torch.from_numpy(sh_rest)
     total = torch.zeros(len(means), 3)
@@ -238,7 +243,9 @@ def _decode_harmonics(coded: Bytes) -> Floats:
     return ((steps - 128) * np.float32(_STEP)).reshape(len(coded), 3, -1).transpose(0, 2, 1)
 
 
-def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+def _write_with(path: Path, splats: SplatArrays, settings: WriteSettings) -> None:
+    from recon_cli.io.views import evenly_spread  # imports what reads images
+
     seen_from = evenly_spread(settings.views, _MOST_CENTERS)
     centers = np.stack([camera.center for _, camera in seen_from]) if seen_from else None
     write_compressed_ply(path, splats.with_sphere(), centers=centers,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.splats import TERMS
+from recon_cli.scene.splat_arrays import TERMS
 from recon_cli.splats.format import Origin
 from recon_cli.splats.values import measure_extent
 

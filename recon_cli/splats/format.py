@@ -7,15 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.scene.camera import Camera
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splat_arrays import SplatArrays
 from recon_cli.splats.axes import nearest_up
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
 
 SHARING = 16
 
@@ -45,11 +49,16 @@ class Origin:
 class LoadedScene:
     """A scene in the axes of recon."""
 
-    splats: Splats
+    arrays: SplatArrays
     up: str | None = None  # axis that the file says is up: z, -y or y; None if it does not
     antialiased: bool = False  # the file says: trained with antialiasing (Mip-Splatting)
     origin: Origin | None = None  # subtracted from all positions; None if nothing was
     writer: str = ""  # what the file says of the program that wrote it; empty if nothing
+
+    @cached_property
+    def splats(self) -> Splats:
+        """The Gaussians as tensors."""
+        return self.arrays.as_tensors()
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +105,7 @@ class SplatFormat:
     load: Callable[[Path], LoadedScene]  # raises FormatError
     # Writes a file, whole or not at all, with the backdrop as Gaussians where the format has no
     # room for one; raises FormatError or InputError if a value does not fit. None: it is only read.
-    write_with: Callable[[Path, Splats, WriteSettings], None] | None = None
+    write_with: Callable[[Path, SplatArrays, WriteSettings], None] | None = None
     # loads a scene without the turn that the file asks for; None where it cannot ask for any
     load_unturned: Callable[[Path], LoadedScene] | None = None
 
@@ -104,7 +113,9 @@ class SplatFormat:
         """Returns the Gaussians of a file; FormatError if it is damaged."""
         return self.load(path).splats
 
-    def write(self, path: Path, splats: Splats, settings: WriteSettings | None = None) -> None:
+    def write(
+        self, path: Path, splats: Splats | SplatArrays, settings: WriteSettings | None = None
+    ) -> None:
         """Writes a file, whole or not at all."""
         assert self.write_with is not None, "a format that is only read"
-        self.write_with(path, splats, settings or WriteSettings())
+        self.write_with(path, splats.as_arrays(), settings or WriteSettings())

@@ -25,16 +25,15 @@ import struct
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError
 from recon_cli.io.calibration import rotation_matrix
 from recon_cli.scene.similarity import Similarity
-from recon_cli.scene.splats import SH_C0, TERMS, Splats, joined, transformed
+from recon_cli.scene.splat_arrays import SH_C0, TERMS, SplatArrays
 from recon_cli.splats.axes import nearest_up
 from recon_cli.splats.foreign import (
     NOT_GAUSSIANS_HINT,
@@ -53,6 +52,9 @@ from recon_cli.splats.values import (
     to_arrays,
 )
 from recon_cli.workspace.atomic import write_bytes
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
 
 # [3, 3] from the scene's axes to those of glTF; whole numbers keep positions exact.
 Z_UP: NDArray[np.float64] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -97,6 +99,8 @@ def write_glb(path: Path, splats: Splats, *, axes: NDArray[np.float64] = Z_UP) -
     is the [3, 3] rotation from the scene's axes to x right, y up, z back. FormatError if there are
     no Gaussians or a value is not finite; InputError if a scale exceeds float32, or the file 4 GiB.
     """
+    from recon_cli.scene.splats import transformed  # imports torch
+
     table = to_arrays(transformed(splats, Similarity(rotation=axes)), ".glb")
     with np.errstate(over="ignore"):
         scales = np.exp(table["log_scales"])
@@ -182,6 +186,8 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
     missing or damaged, holds no Gaussians, or needs an unsupported feature: compression,
     another kernel, linear colours, nodes that stretch. Gaussians that are not finite are dropped.
     """
+    from recon_cli.scene.splats import joined, transformed  # imports torch
+
     container = Container(path)
     required = container.json.get("extensionsRequired", [])
     if not isinstance(required, list) or not all(name in _SUPPORTED for name in required):
@@ -193,7 +199,7 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
             total += len(part)
             if total * _LEAST_BYTES > container.size:
                 raise container.error(f"{total} Gaussians in {container.size} bytes")
-            parts.append(transformed(part, similarity))
+            parts.append(transformed(part.as_tensors(), similarity))
     if not parts:
         raise FormatError(
             f"{path} holds a mesh or points, but no Gaussians (no primitive with {_NAME}).",
@@ -201,13 +207,13 @@ def load_glb(path: Path, *, axes: NDArray[np.float64] | None = None) -> LoadedSc
     degree = max(part.sh_degree for part in parts)
     splats = parts[0] if len(parts) == 1 else joined(
         [part.with_degree(degree) for part in parts])[0]
-    if not all(torch.isfinite(value).all() for value in splats.parameters().values()):
+    if not all(value.isfinite().all() for value in splats.parameters().values()):
         raise container.error("values that overflow float32")
     if axes is None:
         axes = _AXES.get(_read_axes(container.json), Z_UP)
     up = next((name for name, known in _UP.items() if np.array_equal(known, axes)), None)
     return LoadedScene(
-        transformed(splats, Similarity(rotation=axes.T)), up,
+        transformed(splats, Similarity(rotation=axes.T)).as_arrays(), up,
         writer=container.generator(container.json))
 
 
@@ -242,7 +248,7 @@ def _find_primitives(
 
 def _read_primitive(
     container: Container, primitive: dict[str, Any], extension: dict[str, Any]
-) -> Splats:
+) -> SplatArrays:
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict) or primitive.get("mode") != _Gl.POINTS:
         raise container.error("Gaussians that are not points")
@@ -422,9 +428,9 @@ class Container(UntrustedFile):
         return kind, memoryview(data)[start:start + length], start + length
 
 
-def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+def _write_with(path: Path, splats: SplatArrays, settings: WriteSettings) -> None:
     axes = Z_UP if settings.up is None else nearest_axes(settings.up)
-    write_glb(path, splats.with_sphere(), axes=axes)
+    write_glb(path, splats.with_sphere().as_tensors(), axes=axes)
 
 
 FORMAT = SplatFormat(load_glb, _write_with, load_unturned=lambda path: load_glb(path, axes=Y_UP))

@@ -19,14 +19,14 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path, PurePath
 from string import Template
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.camera import Camera, looking_at
-from recon_cli.scene.splats import Splats
+from recon_cli.scene.splat_arrays import SplatArrays
 from recon_cli.scene.statistics import FINE_SAMPLE, ROUNDING
 from recon_cli.splats.axes import UP, turn_from
 from recon_cli.splats.format import LoadedScene, SplatFormat, Tour, WriteSettings
@@ -52,6 +52,9 @@ _PLAIN_TITLE = "A place in 3D"
 _CAMERA_NAME = re.compile(
     r"(img|dsc[nf]?|pxl|vid|mov|mvi|gopr|gx|dji|p)?[-_ ]?[\d_-]{3,}", re.IGNORECASE)
 Z_UP: NDArray[np.float64] = np.array([0.0, 0, 1])
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
 
 # Files in `web/` by the module name that others import; "recon:" marks relative imports.
 MODULES = {
@@ -84,9 +87,9 @@ class PageStyle:
     credits: bool = False  # whether it says what made it
 
 
-def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
+def default_view(splats: Splats | SplatArrays, up: NDArray[np.float64]) -> View:
     """Returns a camera in front of the scene and a little above it, looking at its middle."""
-    middle, radius = measure_extent(splats.means.detach().cpu().numpy())
+    middle, radius = measure_extent(splats.as_arrays().means)
     reach = radius or 1.0
     back = np.array([0.0, -1, 0]) if abs(up[1]) < 0.5 else np.array([0.0, 0, np.sign(up[1])])
     back -= (back @ up) * up
@@ -97,7 +100,8 @@ def default_view(splats: Splats, up: NDArray[np.float64]) -> View:
 
 
 def build_page(
-    style: PageStyle, scene: str, views: Sequence[View], splats: Splats, up: NDArray[np.float64]
+    style: PageStyle, scene: str, views: Sequence[View], splats: SplatArrays,
+    up: NDArray[np.float64],
 ) -> bytes:
     """Returns the page, in which `scene` is the element with the Gaussians."""
     title = html.escape(style.title)
@@ -125,10 +129,10 @@ def _preview(title: str, picture: str | None) -> str:
 
 
 def _views(
-    views: Sequence[View], splats: Splats, up: NDArray[np.float64], tour: Tour | None
+    views: Sequence[View], splats: SplatArrays, up: NDArray[np.float64], tour: Tour | None
 ) -> str:
     """Returns the element with the extent of the scene, the cameras and the tour."""
-    means = splats.means.detach().cpu().double().numpy()
+    means = splats.means.astype(np.float64)
     middle, radius = measure_extent(means)
     reach = radius or 1.0
     sample = means[::-(-len(means) // FINE_SAMPLE)]
@@ -184,7 +188,7 @@ _UP = re.compile(rb'<script id="views" type="application/json">\{"up":\['
 
 
 def write_html(
-    path: Path, splats: Splats, *, style: PageStyle | None = None,
+    path: Path, splats: Splats | SplatArrays, *, style: PageStyle | None = None,
     up: NDArray[np.float64] = Z_UP, views: Sequence[View] = (),
 ) -> None:
     """Writes a page that shows `splats`, completely or not at all.
@@ -193,6 +197,7 @@ def write_html(
     visitor can step through the cameras of `views`; the page opens on its tour, at the first of
     them, or in front of the scene. The errors are those of `spz_bytes`.
     """
+    splats = splats.as_arrays()
     halvings = _halvings(splats)
     # beside the scripts size hardly counts
     packed = spz_bytes(path, turn_from(_STORED, _enlarged(splats, -halvings)), harmonic_step=1,
@@ -204,32 +209,32 @@ def write_html(
         style or PageStyle(), scene, views or [default_view(splats, up)], splats, up))
 
 
-def _halvings(splats: Splats) -> int:
+def _halvings(splats: SplatArrays) -> int:
     """Returns how often the scene is halved until SPZ holds its largest Gaussian.
 
     Below 0 it is doubled, until SPZ holds its fine ones, as far as the others leave room.
     """
     if not len(splats):
         return 0
-    scales = splats.scales.detach()
+    scales = splats.scales
     needed = math.log2(float(scales.max()) / LARGEST_SCALE)
     if not math.isfinite(needed):
         return 0
     if needed > 0:
         return min(_MOST_HALVINGS, math.ceil(needed))
-    fine = float(np.quantile(scales.median(dim=1).values.numpy(), _FINE))
-    farthest = float(splats.means.detach().abs().max())
+    fine = float(np.quantile(np.median(scales, axis=1), _FINE))
+    farthest = float(np.abs(splats.means).max())
     room = min(-needed, math.log2(FARTHEST / max(farthest, fine)))
     wanted = math.ceil(math.log2(SMALLEST_SCALE / max(fine, float(np.finfo(np.float32).tiny))))
     return -max(0, min(wanted, math.floor(room)))
 
 
-def _enlarged(splats: Splats, doublings: int) -> Splats:
+def _enlarged(splats: SplatArrays, doublings: int) -> SplatArrays:
     """Returns the scene in another unit: all lengths times two to the power of `doublings`."""
     if doublings == 0:
         return splats
-    return replace(splats, means=splats.means * 2.0**doublings,
-                   log_scales=splats.log_scales + doublings * math.log(2))
+    return replace(splats, means=splats.means * np.float32(2.0**doublings),
+                   log_scales=splats.log_scales + np.float32(doublings * math.log(2)))
 
 
 def load_html(path: Path) -> LoadedScene:
@@ -254,15 +259,15 @@ def load_html(path: Path) -> LoadedScene:
     if len(packed) != promised:
         raise FormatError(
             f"{path} promises a scene of {promised} bytes, but holds {len(packed)}: it is damaged.")
-    stored = spz_scene(path, packed, axes=_STORED).splats
+    stored = spz_scene(path, packed, axes=_STORED).arrays
     found = _UP.search(data)
     up = next((name for name, axis in UP.items() if found and np.allclose(
         axis, [float(number) for number in found.groups()], rtol=0, atol=ROUNDING)), None)
     return LoadedScene(_enlarged(stored, int(matches[0][3] or 0)), up)
 
 
-def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
-    guide = settings.guide(splats) if settings.guide is not None else None
+def _write_with(path: Path, splats: SplatArrays, settings: WriteSettings) -> None:
+    guide = settings.guide(splats.as_tensors()) if settings.guide is not None else None
     preview = path.with_suffix(".jpg")
     if guide is not None:
         write_bytes(preview, guide.poster)

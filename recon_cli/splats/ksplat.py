@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.splats import SH_C0, TERMS, Splats
+from recon_cli.scene.splat_arrays import SH_C0, TERMS, SplatArrays
 from recon_cli.splats.foreign import FLAT, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.values import decode_opacities, read_contents, splats_from_arrays
@@ -43,7 +43,7 @@ _LIMIT = 1.5  # of coefficients, where the header does not say
 _DEGREES = 3  # 0, 1 and 2
 
 
-def read_ksplat(path: Path) -> Splats:
+def read_ksplat(path: Path) -> SplatArrays:
     """Returns the Gaussians of a .ksplat, section after section.
 
     Those that are not finite are dropped, with a warning. FormatError if the file is damaged.
@@ -133,7 +133,7 @@ def _by_term(rest: NDArray[Any], degree: int) -> NDArray[np.float32]:
     return np.concatenate(parts, axis=1)
 
 
-def _to_splats(path: Path, sections: list[dict[str, NDArray[Any]]]) -> Splats:
+def _to_splats(path: Path, sections: list[dict[str, NDArray[Any]]]) -> SplatArrays:
     terms = max(values["sh_rest"].shape[1] for values in sections)
     for values in sections:
         missing = terms - values["sh_rest"].shape[1]

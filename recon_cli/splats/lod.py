@@ -17,15 +17,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from recon_cli.scene.splats import EXTENT_SIGMAS, Splats, joined, with_rows
-from recon_cli.splats.coarsen import GROUP, coarsen
+from recon_cli.scene.splat_arrays import EXTENT_SIGMAS
 from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.sog import (
     META,
@@ -45,6 +42,9 @@ from recon_cli.workspace.atomic import write_bytes
 from recon_cli.workspace.layout import remove
 from recon_cli.workspace.paths import leads_out
 
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
+
 LOD_META = "lod-meta.json"
 _VERSION = 1
 _LEVELS = 6  # at most
@@ -58,6 +58,8 @@ _FOLDER = re.compile(r"\d+_\d+")  # a file of a level: {level}_{number}
 
 def make_levels(splats: Splats) -> list[Splats]:
     """Returns the scene, and versions of ever fewer Gaussians."""
+    from recon_cli.splats.coarsen import GROUP, coarsen  # imports torch
+
     levels = [splats]
     while len(levels[-1]) > _LEAF and len(levels) < _LEVELS:
         levels.append(coarsen(levels[-1], len(levels[-1]) // GROUP))
@@ -74,6 +76,8 @@ def write_lod(
     and `up` are those of `write_sog`. FormatError if there are no Gaussians, or a value is not
     finite.
     """
+    import torch
+
     folder = path.parent
     folder.mkdir(parents=True, exist_ok=True)
     discard_levels(path)
@@ -115,6 +119,8 @@ def _json(value: Any) -> str:
 
 def _all_colored(splats: Splats) -> Splats:
     """Returns Gaussians that all have coefficients, if any has."""
+    from recon_cli.scene.splats import Splats, with_rows
+
     rest = splats.sh_rest
     if len(rest):
         rest = with_rows(rest, len(splats))
@@ -190,6 +196,8 @@ class _Tree:
 
     def grow(self, leaf: NDArray[np.int64], splats: Splats) -> None:
         """Makes the boxes hold Gaussians in their leaves [N]."""
+        from scipy.spatial.transform import Rotation
+
         quats = normalize_quats(splats.quats.detach().cpu().float().numpy())
         axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
         axes *= splats.scales.detach().cpu().numpy()[:, None]
@@ -244,9 +252,13 @@ def load_lod(path: Path) -> LoadedScene:
         if ends[-1] > most or any(
                 offset < end for (offset, _), end in zip(ranges, ends, strict=False)):
             raise index.error(f"Gaussians of {index.names[file]} twice or beyond its {most}")
+    import torch
+
+    from recon_cli.scene.splats import joined
+
     parts = []
     for archive, file in zip_longest(archives, sorted(wanted)):
-        piece = read_files(archive)
+        piece = read_files(archive).as_tensors()
         if file is not None:  # else it is the environment, all of which is shown
             rows = np.concatenate([np.arange(at, at + count) for at, count in wanted[file]])
             piece = piece.select(torch.from_numpy(rows))
@@ -255,7 +267,7 @@ def load_lod(path: Path) -> LoadedScene:
         raise index.error("a tree without Gaussians")
     degree = max(part.sh_degree for part in parts)
     return LoadedScene(
-        joined([part.with_degree(degree) for part in parts])[0], index.up(index.meta),
+        joined([part.with_degree(degree) for part in parts])[0].as_arrays(), index.up(index.meta),
         writer=index.generator(index.meta))
 
 
@@ -318,4 +330,5 @@ class _Index(UntrustedFile):
 FORMAT = SplatFormat(
     load_lod,
     lambda path, splats, settings: write_lod(
-        path, make_levels(splats.with_sphere()), sharing=settings.sharing, up=settings.up_axis))
+        path, make_levels(splats.with_sphere().as_tensors()), sharing=settings.sharing,
+        up=settings.up_axis))

@@ -22,15 +22,14 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError, InputError, name_command
 from recon_cli.scene.backdrop import SPHERE_GAUSSIANS, Backdrop
-from recon_cli.scene.splats import SH_C0, TERMS, Splats, with_rows
+from recon_cli.scene.splat_arrays import SH_C0, TERMS, SplatArrays
 from recon_cli.scene.statistics import ROUNDING
 from recon_cli.splats.foreign import (
     FLAT,
@@ -51,6 +50,9 @@ from recon_cli.splats.ply_tables import (
 )
 from recon_cli.splats.values import refuse_not_finite, sigmoid, splats_from_arrays, to_arrays
 from recon_cli.workspace.atomic import replacing, write_bytes
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
 
 _REST = [f"f_rest_{i}" for i in range(3 * TERMS[-1])]
 _GROUPS = {
@@ -77,7 +79,8 @@ logger = logging.getLogger("recon")
 
 
 def write_ply(
-    path: Path, splats: Splats, extra: Mapping[str, NDArray[np.float32]] | None = None, *,
+    path: Path, splats: Splats | SplatArrays,
+    extra: Mapping[str, NDArray[np.float32]] | None = None, *,
     comments: Sequence[str] = (),
 ) -> None:
     """Writes `splats` to `path`, whole or not at all, with more `comments` in the header.
@@ -86,22 +89,17 @@ def write_ply(
     skip them. Those of the backdrop's sphere, which has none of its own, are the greatest.
     """
     backdrop, splats = splats.backdrop, splats.with_sphere()
-    n = len(splats)
+    arrays = splats.as_arrays()
+    n, rest = len(arrays), arrays.sh_rest if len(arrays.sh_rest) else arrays.sh_rest[:, :0]
     extra = {name: np.pad(values, (0, n - len(values)), constant_values=values.max(initial=0.0))
              for name, values in (extra or {}).items()}
-    if not len(splats.sh_rest):
-        splats = splats.with_degree(0)
-    rest = _REST[: 3 * TERMS[splats.sh_degree]]
-    raw = {name: value.detach().cpu().float() for name, value in splats.parameters().items()}
-    columns = {
-        **raw, "normals": torch.zeros(n, 3),
-        "sh_rest": with_rows(raw["sh_rest"], n).transpose(1, 2).reshape(n, len(rest)),
-        "logit_opacities": raw["logit_opacities"][:, None],
-    }
-    table = np.column_stack([
-        torch.cat([columns[name] for name in _GROUPS], dim=1).numpy(), *extra.values()])
+    coefficients = np.zeros((n, 3, rest.shape[1]), np.float32)
+    coefficients[:len(rest)] = rest.transpose(0, 2, 1)
+    columns = {**arrays.parameters(), "normals": np.zeros((n, 3), np.float32),
+               "sh_rest": coefficients.reshape(n, 3 * rest.shape[1])}
+    table = np.column_stack([*(columns[name] for name in _GROUPS), *extra.values()])
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(n, splats.sh_degree, tuple(extra), backdrop, comments))
+        file.write(_header(n, TERMS.index(rest.shape[1]), tuple(extra), backdrop, comments))
         file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
 
 
@@ -150,7 +148,12 @@ def max_gaussians(size: int, sh_degree: int, backdrop: Backdrop | None = None) -
 
 
 def read_ply(path: Path) -> Splats:
-    """Returns the Gaussians of a .ply as float32 tensors, in the file's order, with their values.
+    """Returns the Gaussians of a .ply as float32 tensors; see `read_arrays`."""
+    return read_arrays(path).as_tensors()
+
+
+def read_arrays(path: Path) -> SplatArrays:
+    """Returns the Gaussians of a .ply in float32, in the file's order, with their values.
 
     Those after the last one with a coefficient other than zero are of degree 0. The sphere of a
     backdrop, unless another program has changed it, becomes one again. Elements besides
@@ -289,15 +292,16 @@ def _read_colors(path: Path, table: NDArray[np.void]) -> dict[str, NDArray[np.fl
     return {name: ((table[name].astype(np.float32) / most - 0.5) / SH_C0) for name in _COLOR}
 
 
-def _without_sphere(splats: Splats, header_backdrop: tuple[int, Backdrop] | None) -> Splats:
+def _without_sphere(
+    splats: SplatArrays, header_backdrop: tuple[int, Backdrop] | None
+) -> SplatArrays:
     """Returns splats whose last rows show a backdrop with it in place of those rows."""
     if header_backdrop is None or header_backdrop[0] > len(splats):
         return splats
     count, backdrop = header_backdrop
-    near = splats.select(torch.arange(len(splats) - count))
-    found = dataclasses.replace(near, backdrop=backdrop)
+    found = dataclasses.replace(splats.first(len(splats) - count), backdrop=backdrop)
     ours = found.with_sphere().parameters()
-    same = all(ours[name].shape == value.shape and torch.allclose(ours[name], value, rtol=ROUNDING)
+    same = all(ours[name].shape == value.shape and np.allclose(ours[name], value, rtol=ROUNDING)
                for name, value in splats.parameters().items())
     return found if same else splats
 
@@ -347,7 +351,7 @@ def _vertices(header: Header) -> NDArray[np.void]:
     return tables["vertex"]
 
 
-def write_points(path: Path, splats: Splats) -> None:
+def write_points(path: Path, splats: Splats | SplatArrays) -> None:
     """Writes centres and plain colours of the opaque Gaussians as a point cloud.
 
     InputError if no Gaussian is opaque enough, FormatError if a value is not finite.
@@ -394,7 +398,7 @@ def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
     return points, colors.astype(np.uint8)
 
 
-def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+def _write_with(path: Path, splats: SplatArrays, settings: WriteSettings) -> None:
     write_ply(path, splats, comments=describe_settings(settings))
 
 

@@ -18,16 +18,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon_cli.scene.splats import SH_C0, TERMS, Splats
+from recon_cli.scene.splat_arrays import SH_C0, TERMS
 from recon_cli.splats.axes import read_up_comment, up_comment
 from recon_cli.splats.foreign import FLAT, drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat
-from recon_cli.splats.merge_tree import MergeTree, build_tree
 from recon_cli.splats.values import (
     MOST_PARTS,
     UntrustedFile,
@@ -37,6 +36,10 @@ from recon_cli.splats.values import (
     to_arrays,
 )
 from recon_cli.workspace.atomic import write_bytes
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
+    from recon_cli.splats.merge_tree import MergeTree
 
 _MAGIC, _CHUNK_MAGIC = b"RAD0", b"RADC"
 _MOST_SPLATS, _CHUNK = 1 << 31, 1 << 16
@@ -274,6 +277,8 @@ def write_rad(path: Path, splats: Splats, *, up: str | None = None) -> None:
 
     FormatError if there are no Gaussians, a value is not finite, or a colour is above 65504.
     """
+    from recon_cli.splats.merge_tree import build_tree  # imports torch
+
     to_arrays(splats, path.name)  # refuses what cannot be written before the tree is made
     tree = build_tree(splats)
     degree, count = tree.splats.sh_degree, len(tree.splats)
@@ -353,4 +358,4 @@ def _pack_json(magic: bytes, meta: Mapping[str, Any]) -> bytes:
 
 FORMAT = SplatFormat(
     load_rad, lambda path, splats, settings: write_rad(
-        path, splats.with_sphere(), up=settings.up_axis))
+        path, splats.as_tensors().with_sphere(), up=settings.up_axis))

@@ -6,15 +6,18 @@ import logging
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
+import numpy as np
 
 from recon_cli.errors import FormatError, InputError, name_command
-from recon_cli.scene.splats import Splats
 from recon_cli.splats.axes import signs, turn_from, up_of
 from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.values import MOST_HEAD_BYTES, read_start
 from recon_cli.workspace.export_formats import EXPORT_FORMATS, READABLE, ExportFormat
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
 
 logger = logging.getLogger("recon")
 
@@ -70,7 +73,8 @@ def put_in_place(scene: LoadedScene, name: str) -> Splats:
         return scene.splats
     logger.warning("%s: %s, and added again here, rounded; %s leaves it out",
                    name, scene.origin.describe(), name_command("import"))
-    return replace(scene.splats, means=scene.splats.means + torch.tensor(scene.origin.point))
+    means = scene.arrays.means + np.array(scene.origin.point, np.float32)
+    return replace(scene.arrays, means=means).as_tensors()
 
 
 def load_splats(path: Path, *, axes: str | None = None) -> LoadedScene:
@@ -99,4 +103,4 @@ def _turn(scene: LoadedScene, axes: str) -> LoadedScene:
     if origin is not None:
         x, y, z = (sign * at for sign, at in zip(signs(axes), origin.point, strict=True))
         origin = replace(origin, point=(x, y, z))
-    return replace(scene, splats=turn_from(axes, scene.splats), up=up_of(axes), origin=origin)
+    return replace(scene, arrays=turn_from(axes, scene.arrays), up=up_of(axes), origin=origin)

@@ -24,13 +24,13 @@ import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from recon_cli.scene.splats import LEAST_OPACITY, TERMS, Splats
+from recon_cli.scene.splat_arrays import LEAST_OPACITY, TERMS, SplatArrays
 from recon_cli.splats.codebooks import BOOK, fit_codebook, fit_palette, nearest_entries
 from recon_cli.splats.format import SHARING, LoadedScene, SplatFormat
 from recon_cli.splats.values import (
@@ -51,6 +51,9 @@ from recon_cli.splats.values import (
 from recon_cli.workspace.atomic import read_bytes, write_bytes
 from recon_cli.workspace.paths import leads_out
 
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
+
 ROW = 64  # palette entries in a row of their image
 _TAG = 252  # of a quaternion whose greatest component is w
 _ROOT2 = math.sqrt(2)  # only the greatest component of a unit quaternion exceeds 1 / sqrt(2)
@@ -66,7 +69,7 @@ Doubles = NDArray[np.float64]
 
 
 def write_sog(
-    path: Path, splats: Splats, *, seed: int = 0, sharing: int = SHARING,
+    path: Path, splats: Splats | SplatArrays, *, seed: int = 0, sharing: int = SHARING,
     antialiased: bool = False, up: str | None = None,
 ) -> None:
     """Writes `splats` to `path`, whole or not at all; the same seed gives the same bytes.
@@ -84,7 +87,7 @@ def write_sog(
 
 
 def pack_splats(
-    splats: Splats, groups: NDArray[np.int64] | None = None, *, seed: int = 0,
+    splats: Splats | SplatArrays, groups: NDArray[np.int64] | None = None, *, seed: int = 0,
     sharing: int = SHARING,
 ) -> tuple[dict[str, Any], dict[str, Bytes]]:
     """Returns the content of meta.json, and the images by name; see `write_sog`.
@@ -152,7 +155,7 @@ def load_sog(path: Path) -> LoadedScene:
         read_files(archive), archive.up(meta), antialiased, writer=archive.generator(meta))
 
 
-def read_files(archive: SogFiles) -> Splats:
+def read_files(archive: SogFiles) -> SplatArrays:
     """Returns the Gaussians of the files of a .sog; see `load_sog`."""
     path, meta = archive.path, archive.meta()
     means, scales, quats, sh0 = (

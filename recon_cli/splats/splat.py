@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.splats import SH_C0, Splats
+from recon_cli.scene.splat_arrays import SH_C0, SplatArrays
 from recon_cli.splats.foreign import drop_not_finite
 from recon_cli.splats.format import LoadedScene, SplatFormat
 from recon_cli.splats.values import (
@@ -26,6 +27,9 @@ from recon_cli.splats.values import (
 )
 from recon_cli.workspace.atomic import write_bytes
 
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
+
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _LEAST = np.finfo(np.float32).tiny  # replaces a scale of 0, which has no logarithm
 _LARGEST = 88.0  # of a log scale; the exponential of more is infinite in float32
@@ -33,7 +37,7 @@ _LARGEST = 88.0  # of a log scale; the exponential of more is infinite in float3
 _OTHER_FORMATS = (b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b\x08\0", b"PK\x03\x04")
 
 
-def write_splat(path: Path, splats: Splats) -> None:
+def write_splat(path: Path, splats: Splats | SplatArrays) -> None:
     """Writes `splats` to `path`, whole or not at all, in descending order of opacity x volume.
 
     Harmonics of degrees 1 and up are dropped, and colours are clipped to 0 to 1. FormatError if
@@ -53,7 +57,7 @@ def write_splat(path: Path, splats: Splats) -> None:
     write_bytes(path, rows[np.argsort(-importance, kind="stable")].tobytes())
 
 
-def read_splat(path: Path) -> Splats:
+def read_splat(path: Path) -> SplatArrays:
     """Returns the Gaussians of a .splat, degree 0, in the file's order.
 
     Those that are not finite are dropped, with a warning. FormatError if the file is damaged.

@@ -25,14 +25,14 @@ import zlib
 from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 import zstandard
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.splats import TERMS, Splats
+from recon_cli.scene.splat_arrays import TERMS, SplatArrays
 from recon_cli.splats.axes import (
     AXES,
     PLY,
@@ -60,6 +60,9 @@ from recon_cli.splats.values import (
     to_arrays,
 )
 from recon_cli.workspace.atomic import write_bytes
+
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
 
 logger = logging.getLogger("recon")
 
@@ -113,7 +116,7 @@ class _Extension(IntEnum):
 
 
 def write_spz(
-    path: Path, splats: Splats, *, version: int = 3, up: str | None = None,
+    path: Path, splats: Splats | SplatArrays, *, version: int = 3, up: str | None = None,
     antialiased: bool = False,
 ) -> None:
     """Writes `splats` to `path`, whole or not at all; see `spz_bytes`."""
@@ -121,8 +124,9 @@ def write_spz(
 
 
 def spz_bytes(
-    path: Path, splats: Splats, *, version: int = 3, harmonic_step: int = _HARMONIC_STEP,
-    least_bits: int = POSITION_BITS, up: str | None = None, antialiased: bool = False,
+    path: Path, splats: Splats | SplatArrays, *, version: int = 3,
+    harmonic_step: int = _HARMONIC_STEP, least_bits: int = POSITION_BITS, up: str | None = None,
+    antialiased: bool = False,
 ) -> bytes:
     """Returns the bytes of an SPZ file of `splats`, whose values are written as they are.
 
@@ -137,10 +141,8 @@ def spz_bytes(
     """
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} is not one of {VERSIONS}")
-    values = Splats.from_parameters({
-        name: torch.from_numpy(value) for name, value in to_arrays(splats, path.name).items()})
-    means, quats = values.means.numpy(), values.quats.numpy()
-    log_scales = values.log_scales.numpy()
+    values = SplatArrays.from_parameters(to_arrays(splats, path.name))
+    means, quats, log_scales = values.means, values.quats, values.log_scales
     large = int((log_scales.max(axis=1) > _LARGEST_SCALE).sum())
     if large:
         logger.warning(
@@ -156,12 +158,12 @@ def spz_bytes(
     header = SpzHeader(version, len(splats), values.sh_degree, bits, axes, up, antialiased)
     return pack(header, [
         _position_bytes(means, bits),
-        encode_opacities(values.logit_opacities.numpy()),
-        round_to_bytes(255 * (_COLOR * values.sh_dc.numpy() + 0.5)),
+        encode_opacities(values.logit_opacities),
+        round_to_bytes(255 * (_COLOR * values.sh_dc + 0.5)),
         round_to_bytes(_SCALE_STEPS * (log_scales + _SCALE_OFFSET)),
         _vector_bytes(quats) if version < 3 else _rotation_bytes(quats),
         round_to_bytes(_HARMONIC + harmonic_step * np.rint(
-            values.sh_rest.numpy() * (_HARMONIC / harmonic_step))),
+            values.sh_rest * (_HARMONIC / harmonic_step))),
     ])
 
 
@@ -457,7 +459,7 @@ def _too_long_error(path: Path) -> FormatError:
     return FormatError(f"{path} holds more than its header promises: it is damaged or malicious.")
 
 
-def _write_with(path: Path, splats: Splats, settings: WriteSettings) -> None:
+def _write_with(path: Path, splats: SplatArrays, settings: WriteSettings) -> None:
     write_spz(
         path, splats.with_sphere(LARGEST_SCALE), version=settings.options.get("spz_version", 3),
         up=settings.up_axis, antialiased=settings.antialiased)

@@ -6,18 +6,24 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon_cli.errors import FormatError
-from recon_cli.scene.splats import Splats, with_rows
+from recon_cli.scene.splat_arrays import Floats as Floats
+from recon_cli.scene.splat_arrays import SplatArrays
 from recon_cli.scene.voxels import BITS
 from recon_cli.splats.axes import UP
 
+if TYPE_CHECKING:
+    from recon_cli.scene.splats import Splats
+
+HUGE = 0.1  # of the distance from the middle, at least of the radius
+WIDE = 10.0  # times the size of the bulk: the room is a dot in a viewer that shows all
 BULK = 0.9  # share of the Gaussians that determines the size of a scene; some lie far away
+_BULK_BOX = (0.05, 0.95)  # quantiles along each axis, between which the bulk lies
 _FAR = 10.0  # times the median distance of all from their middle
 _SHELL = 1.5  # outer distance over the inner one
 _LARGEST = float(np.finfo(np.float32).max)
@@ -25,7 +31,6 @@ _LARGEST = float(np.finfo(np.float32).max)
 HARMLESS_BYTES, MAX_RATIO = 1 << 24, 128
 MOST_PARTS = 1 << 16  # of a scene: files or chunks
 MOST_HEAD_BYTES = 1 << 20  # of what describes a file; most need a hundredth of it
-Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 
@@ -35,11 +40,24 @@ def measure_extent(means: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64
     return middle, float(np.quantile(np.linalg.norm(means - middle, axis=1), BULK))
 
 
-def measure_distances(means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def measure_distances(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Returns the distances [N] of centres [N, 3] from their middle and the radius of most."""
-    away = (means - means.median(dim=0).values).norm(dim=1)
-    # torch.quantile takes 16 million values at most
-    return away, away.sort().values[round(BULK * (len(away) - 1))]
+    away = np.linalg.norm(means - lower_median(means), axis=1)
+    return away, float(np.sort(away)[round(BULK * (len(away) - 1))])
+
+
+def lower_median(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the median over the first axis; the lower one of the two in the middle."""
+    return np.asarray(np.partition(values, (len(values) - 1) // 2, axis=0)[(len(values) - 1) // 2])
+
+
+def find_bulk(
+    means: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the lowest and the highest corner [3] of the box that the bulk [N, 3] lies in."""
+    low, high = (round(share * (len(means) - 1)) for share in _BULK_BOX)
+    order = np.partition(means, (low, high), axis=0)
+    return order[low], order[high]
 
 
 def morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -177,8 +195,8 @@ class UntrustedFile:
         return np.array(value, np.float64)
 
 
-def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats:
-    """Returns the values of a file as float32 tensors, in the file's order.
+def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> SplatArrays:
+    """Returns the values of a file in float32, in the file's order.
 
     `values` are the parameters by their names in `Splats`. Gaussians behind the last one with a
     coefficient other than zero are of degree 0. FormatError if a value is not finite.
@@ -187,7 +205,7 @@ def splats_from_arrays(path: Path, values: Mapping[str, NDArray[Any]]) -> Splats
         plain = {name: np.array(value, np.float32, order="C") for name, value in values.items()}
     refuse_not_finite(path, plain)
     plain["sh_rest"] = trim_zero_rows(plain["sh_rest"]).copy()
-    return Splats.from_parameters({name: torch.from_numpy(value) for name, value in plain.items()})
+    return SplatArrays.from_parameters(plain)
 
 
 def refuse_above(path: Path, log_scales: Floats, most: float) -> None:
@@ -247,7 +265,7 @@ def _others(largest: NDArray[np.int64]) -> NDArray[np.bool_]:
 _Float = TypeVar("_Float", bound=np.floating[Any])
 
 
-def to_arrays(splats: Splats, kind: str) -> dict[str, NDArray[np.float32]]:
+def to_arrays(splats: Splats | SplatArrays, kind: str) -> dict[str, NDArray[np.float32]]:
     """Returns the raw parameters as float32 arrays by name, `sh_rest` for all N Gaussians.
 
     Quaternions are normalized; zeros, which mean no rotation, become 1 0 0 0. If no Gaussian has
@@ -256,11 +274,10 @@ def to_arrays(splats: Splats, kind: str) -> dict[str, NDArray[np.float32]]:
     """
     if not len(splats):
         raise FormatError(f"There are no Gaussians to write; a {kind} needs at least one.")
-    if not len(splats.sh_rest):
-        splats = splats.with_degree(0)
-    values = {name: value.detach().cpu().float() for name, value in splats.parameters().items()}
-    values["sh_rest"] = with_rows(values["sh_rest"], len(splats))
-    table = {name: value.numpy() for name, value in values.items()}
+    arrays = splats.as_arrays()
+    table, rest = arrays.parameters(), arrays.sh_rest
+    table["sh_rest"] = np.pad(rest[:, :rest.shape[1] if len(rest) else 0],
+                              ((0, len(arrays) - len(rest)), (0, 0), (0, 0)))
     refuse_not_finite(f"The scene for a {kind}", table)
     table["quats"] = normalize_quats(table["quats"])
     return table

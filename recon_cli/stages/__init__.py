@@ -105,9 +105,9 @@ STAGES: tuple[Stage, ...] = (
     Stage(name="ingest", verb="ingest", config=IngestConfig, summary=IngestSummary, version=6,
           module="recon_cli.stages.ingest", input_metavar="VIDEO"),
     Stage(name="denoise", verb="denoise", needs=("ingest",), config=DenoiseConfig,
-          summary=DenoiseSummary, version=4, auto=True, module="recon_cli.stages.denoise"),
+          summary=DenoiseSummary, version=5, auto=True, module="recon_cli.stages.denoise"),
     Stage(name="sfm", verb="sfm", needs=("ingest",), config=SfmConfig, summary=SfmSummary,
-          version=5, auto=True, module="recon_cli.stages.sfm", own_digests=True,
+          version=6, auto=True, module="recon_cli.stages.sfm", own_digests=True,
           volatile=("database.db", "log.txt", "steps.json*", "segments.json"),
           options=tuple(
               item.name for item in fields(SfmConfig) if item.name not in _PLACE_OPTIONS)),

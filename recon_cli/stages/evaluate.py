@@ -25,7 +25,6 @@ from recon_cli.evaluation.intervals import Interval, paired_bootstrap
 from recon_cli.evaluation.metrics import (
     CONVENTION_LINES,
     CONVENTIONS,
-    ERROR_GAIN,
     FACES_CONVENTION,
     LPIPS_CONVENTION,
     MASK_CONVENTION,
@@ -45,6 +44,7 @@ from recon_cli.evaluation.reference_views import (
     score_views,
 )
 from recon_cli.evaluation.scores import (
+    ERROR_GAIN,
     REFERENCE,
     Metrics,
     ModelMetrics,

@@ -66,6 +66,8 @@ class _Export:
         capture = PlacedCapture.read(inputs.folders) if placed else None
         _refuse_without_views(config, record, has_views=placed)
         self._pruned = "prune" in inputs.folders and config.model != "base"
+        if self._model.config.compact_only and not self._pruned:
+            ctx.notice("the original is unfinished: its training ended where pruning begins")
         self._antialiased = bool(
             record and record.antialiased and not (self._pruned or self._model.trained))
         self._frame = choose_frame(config, capture, record.up() if record else None)

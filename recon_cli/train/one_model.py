@@ -38,7 +38,11 @@ def fit_scene(
         model.write_inherited_files(task.schedule, out, ctx)
     state = first_or_saved(task, scene, out / CHECKPOINT, model)
     plan = task.schedule
-    until = plan.mid if plan.config.compact_only else plan.config.iterations
+    until = plan.config.iterations
+    if plan.config.compact_only:
+        until = plan.mid
+        ctx.notice(f"training ends after {until:,} of {plan.config.iterations:,} steps, where "
+                   "pruning begins: without it the scene is unfinished")
     run_fit(state, task, until, RunSegment(
         out, "train", until, first=plan.first,
         keep={plan.mid: "mid.safetensors"}), ctx)

@@ -17,9 +17,8 @@ from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.scene import Scene
 from recon_cli.trust.heat_map import heat_colors
 from recon_cli.trust.poorly_seen import find_poorly_seen
+from recon_cli.trust.records import FOLDER, TrustRecord
 from recon_cli.trust.scene_trust import (
-    FOLDER,
-    TrustRecord,
     measure_trust,
     model_trust,
     views_looked_at,

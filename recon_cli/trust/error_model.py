@@ -25,16 +25,9 @@ from recon_cli.render.torch.projection import colors_from_sh
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import SH_C0, Splats
 from recon_cli.scene.train_view import TrainView
+from recon_cli.trust.records import PRIOR, TERMS, ErrorModel
 from recon_cli.trust.support import ViewingGeometry, ViewSupport, error_image
-from recon_cli.workspace.summaries import JsonRecord
 
-# Weights without any evidence, and where to the fit is drawn: those of seven captures, rounded, a
-# third of each missing (tests/bench/fit_trust_weights.py); the rooms that docs/trust.md shows are
-# not among them.
-PRIOR: Mapping[str, float] = {
-    "hole": 1.5, "few": 0.05, "angle": 0.25, "residual": 0.55, "depth": 0.03, "color": 0.4,
-    "nearer": 0.2, "edges": 0.05}
-TERMS = tuple(PRIOR)
 # Pull towards PRIOR in the units of the mean deviance. AUSE on novel views changes by .003 from
 # .001 to 10; the reliability gap of two rooms is least from .1 to .3.
 _RIDGE = 0.1
@@ -47,30 +40,6 @@ _EDGE = 3e-3  # intensity a pixel
 MIN_BIAS_ERROR = 1e-6
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ErrorModel(JsonRecord):
-    """The calibrated model of a scene, as trust.json holds it."""
-
-    bias: float
-    weights: Mapping[str, float]  # by the names of TERMS
-    means: Mapping[str, float]  # of the terms over the pixels that it was fitted to
-    views: int  # that it was fitted to
-    calibrated: bool  # on validation views; else on training views, which flatter
-
-    def expect(self, terms: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Returns the expected absolute error, 0 to 1, for terms of one shape."""
-        log = sum(self.weights[name] * terms[name] for name in TERMS) + self.bias
-        return np.asarray(np.exp(np.minimum(log, 0)), np.float32)
-
-    def expect_gaussians(self, support: ViewSupport, sight: ViewingGeometry) -> NDArray[np.float32]:
-        """Returns the expected error [N] of Gaussians as seen from one place.
-
-        What only a picture tells (holes, edges, spreads) is as in the mean.
-        """
-        means = {name: np.full(1, value, np.float32) for name, value in self.means.items()}
-        return self.expect(means | gaussian_terms(support, sight))
 
 
 def gaussian_terms(support: ViewSupport, sight: ViewingGeometry) -> dict[str, NDArray[np.float32]]:

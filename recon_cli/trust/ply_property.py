@@ -25,7 +25,7 @@ def expected_errors(splats: Splats, trust: Trust) -> NDArray[np.float32]:
     angle = torch.where(unseen, torch.pi, 0.0).to(splats.means.dtype)
     sight = ViewingGeometry(angle.to(trust.support.residual.device),
                   torch.zeros_like(trust.support.residual))
-    return trust.error.expect_gaussians(trust.support, sight)
+    return trust.expect_gaussians(sight)
 
 
 def match_rows(means: Tensor, originals: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -7,7 +7,6 @@ them again, from several places that lie apart.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,42 +15,15 @@ from scipy.ndimage import label
 
 from recon_cli.errors import MOST_NAMED
 from recon_cli.scene.statistics import MIN_OBSERVATIONS
+from recon_cli.trust.records import MIN_SPAN_DEG, PoorlySeenRegion
 from recon_cli.trust.support import ViewSupport
-from recon_cli.trust.surface import CELL, MIN_SPAN_DEG, SurfaceCells
-from recon_cli.workspace.summaries import JsonRecord
+from recon_cli.trust.surface import CELL, SurfaceCells
 
 _LEAST = 0.002  # of the surface; smaller regions are noise around edges
 _BLOCK = 3  # cells: what lies so near together, some 20 cm in a room, is one region
 _LONGEST = round(1 / CELL)  # cells: a longer region is cut, so that its place says where it is
 
 Grid = NDArray[np.int64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoorlySeenRegion(JsonRecord):
-    """A region of surface that is not well seen, as `surface` counts it."""
-
-    position: tuple[float, ...]  # [3] of its middle, on the surface; world units
-    size: float  # its longest side, world units
-    share: float  # of the surface
-    few: bool  # most of it is shown by too few views, and not by views from one direction
-    views: int  # that show it, the median of its Gaussians
-    span_deg: float  # angle that the rays of these views span, the median
-    frame: str  # name of the training view that shows most of it
-
-    @property
-    def cause(self) -> str:
-        """Why it is poorly seen, in words."""
-        views = f"{self.views} view{'' if self.views == 1 else 's'}"
-        if self.few:
-            return f"only {views} show{'s' if self.views == 1 else ''} it"
-        return f"{views} show it, from directions only {self.span_deg:.0f} degrees apart"
-
-    def describe(self, unit: str) -> str:
-        """Returns the region in words; `unit` is m or scene units."""
-        x, y, z = self.position
-        return (f"at {x:.2f} {y:.2f} {z:.2f}, {self.size:.2g} {unit} across, {self.share:.1%} of "
-                f"the surface: {self.cause}; {self.frame} shows most of it")
 
 
 def find_poorly_seen(

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from recon_cli.errors import FormatError, ManifestError
 from recon_cli.evaluation.scores import Metrics, ViewScore
-from recon_cli.trust.scene_trust import ModelTrust, TrustRecord
+from recon_cli.trust.records import ModelTrust, TrustRecord
 from recon_cli.workspace.records import Frame
 from recon_cli.workspace.summaries import PlaceSummary
 

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext
-from recon_cli.errors import Hint, ManifestError, StageError
+from recon_cli.errors import ManifestError, StageError
 from recon_cli.evaluation.reference_views import RenderedModel, load_reference_views
 from recon_cli.io.views import ReferenceView, evenly_spread
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.scene import Scene, View
 from recon_cli.scene.splats import Splats
 from recon_cli.trust.agreement import ause, reliability
-from recon_cli.trust.error_model import ErrorModel, calibrate, picture_terms
+from recon_cli.trust.error_model import calibrate, gaussian_terms, picture_terms
 from recon_cli.trust.heat_map import FULL
 from recon_cli.trust.neighbors import (
     pose_distances,
@@ -28,86 +28,26 @@ from recon_cli.trust.neighbors import (
     spread_views,
     support_of_all,
 )
-from recon_cli.trust.poorly_seen import PoorlySeenRegion
+from recon_cli.trust.records import (
+    FOLDER,
+    Agreement,
+    ErrorModel,
+    ModelTrust,
+    SurfaceShares,
+    TrustRecord,
+)
 from recon_cli.trust.support import (
     MAX_VIEWS,
+    ViewingGeometry,
     ViewSupport,
     error_image,
     measure_support,
 )
-from recon_cli.trust.surface import SurfaceShares
-from recon_cli.workspace.atomic import read_json, write_json
 from recon_cli.workspace.records import ImportRecord, need_views
-from recon_cli.workspace.summaries import JsonRecord
 
-FOLDER = "trust"  # in that of evaluate
-RECORD = "trust.json"
 _AT_ONCE = 16  # training photos in memory
 _CALIBRATION = 12  # views that the errors are calibrated on, at most
 _PIXELS = 25_000  # of each view whose agreement is measured, about: sorting takes most time
-
-
-@dataclass(frozen=True, kw_only=True)
-class Agreement(JsonRecord):
-    """Expected against real errors of views that neither trained nor calibrated."""
-
-    views: int
-    ause: float  # of the expected error, mean over the views
-    ause_opacity: float  # of 1 - alpha, for comparison
-    ause_depth: float  # of the depth
-    expected: tuple[float, ...]  # mean errors in ten bins of equally many pixels
-    real: tuple[float, ...]
-    gap: float  # mean of |expected - real| / real over the bins
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelTrust(JsonRecord):
-    """The record of one model in trust.json."""
-
-    views: int  # training views that were looked at
-    error: ErrorModel
-    surface: SurfaceShares
-    agreement: Agreement | None = None  # None without held-out views
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrustRecord(JsonRecord):
-    """trust.json: the models of a workspace, and the largest poorly seen regions."""
-
-    models: tuple[str, ...]
-    base: ModelTrust | None = None
-    pruned: ModelTrust | None = None
-    reason: str = ""  # why it was not measured; empty where it was
-    metres: bool = False  # world units are metres
-    poorly_seen: tuple[PoorlySeenRegion, ...] = ()  # of the model that export takes
-
-    @staticmethod
-    def read(evaluate: Path) -> TrustRecord | None:
-        """Returns the record in evaluate's folder; None where an earlier version left none.
-
-        FormatError or ManifestError if it is damaged.
-        """
-        path = evaluate / FOLDER / RECORD
-        hint = Hint("eval", again=True)
-        return TrustRecord.from_json(read_json(path, dict, hint=hint)) if path.exists() else None
-
-    def write(self, evaluate: Path) -> None:
-        """Writes the record into evaluate's folder."""
-        write_json(evaluate / FOLDER / RECORD, self.to_json())
-
-    def model_trust(self, model: str) -> ModelTrust | None:
-        """Returns the record of base or pruned."""
-        return {"base": self.base, "pruned": self.pruned}[model]
-
-    @property
-    def unit(self) -> str:
-        """The unit of positions, for people."""
-        return "m" if self.metres else "scene units"
-
-    def lines(self) -> list[str]:
-        """Returns the poorly seen regions in words, a line each."""
-        return [f"poorly seen ({number}) {region.describe(self.unit)}"
-                for number, region in enumerate(self.poorly_seen, 1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +65,14 @@ class Trust:
         picture = picture_terms(
             RenderedModel(splats, self.sh_degree, backend), self.support, camera)
         return self.error.expect(picture.terms)
+
+    def expect_gaussians(self, sight: ViewingGeometry) -> NDArray[np.float32]:
+        """Returns the expected error [N] of Gaussians as seen from one place.
+
+        What only a picture tells (holes, edges, spreads) is as in the mean.
+        """
+        means = {name: np.full(1, value, np.float32) for name, value in self.error.means.items()}
+        return self.error.expect(means | gaussian_terms(self.support, sight))
 
     def describe_pictures(self) -> dict[str, Any]:
         """Returns the meaning of a 16-bit picture of it, for readers and as its fingerprint."""

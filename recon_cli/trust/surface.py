@@ -11,24 +11,13 @@ from numpy.typing import NDArray
 from recon_cli.scene.splats import Splats
 from recon_cli.scene.statistics import MIN_OBSERVATIONS
 from recon_cli.splats.ply import MIN_OPACITY
+from recon_cli.trust.records import MIN_SPAN_DEG, SurfaceShares
 from recon_cli.trust.support import ViewSupport
-from recon_cli.workspace.summaries import JsonRecord
 
-MIN_SPAN_DEG = 10.0  # below, depth hangs on a fraction of a pixel
 # Median distances from the middle beyond which a surface is outside, as through a window. The
 # corner of an oblong room is two away.
 _ROOM = 3.0
 CELL = 0.03  # median distances: some centimetres in a room
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfaceShares(JsonRecord):
-    """Shares of the surface that some training view shows; they add up to 1."""
-
-    well: float  # by MIN_OBSERVATIONS views or more that span MIN_SPAN_DEG or more
-    narrow: float  # by so many views, but from one direction
-    few: float  # by fewer views
-    cells: int  # of the surface
 
 
 def surface_rows(splats: Splats, support: ViewSupport) -> torch.Tensor:

@@ -50,4 +50,4 @@ class TrustTint:
             full[rows] = means
             means = full
         sight = trust.support.seen_from(means, np.asarray(place, np.float64))
-        return tint(colors, trust.error.expect_gaussians(trust.support, sight)[rows])
+        return tint(colors, trust.expect_gaussians(sight)[rows])

@@ -22,7 +22,7 @@ MAX_LOSS_DB = 0.3  # on the validation views, where a row and --max-loss say not
 # mean square); rounding an image to 8 bits alone leaves 58.9 dB, 0.29 levels. Only pictures without
 # noise, such as renders, get there; the scenes of photos stay below 40 dB.
 CLEAN_DB = 45.0
-PLAN = "plan.svg"
+PLAN, MEASURES = "plan.svg", "measures.json"
 TRANSFORM = "transform.json"  # beside the .ply: the frame of all files
 _STEM = "splats"
 _MESH_OPTIONS = ("max_triangles", "voxel")
@@ -119,7 +119,7 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {row.name: row for row in (
     ExportFormat("mesh.glb", "mesh", "mesh.glb", options=_TEXTURE_OPTIONS),
     ExportFormat("mesh.obj", "mesh", "mesh.obj", more_files=(
         "mesh.mtl", "mesh.png", "mesh.jpg"), options=_TEXTURE_OPTIONS),
-    ExportFormat(PLAN, "plan", PLAN, more_files=("measures.json",), options=_MESH_OPTIONS),
+    ExportFormat(PLAN, "plan", PLAN, more_files=(MEASURES,), options=_MESH_OPTIONS),
 )}
 
 EXPORT_FORMATS.update(

@@ -50,22 +50,21 @@ def test_look_at_puts_its_target_in_the_middle_and_up_above() -> None:
     assert above[0] == pytest.approx(0)
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    ({}, "needs viewmat or pose"),
-    ({"viewmat": np.eye(4), "pose": np.eye(4)}, "needs viewmat or pose"),
-    ({"viewmat": 2 * np.eye(4)}, "viewmat is not a rigid pose"),
-    ({"viewmat": np.diag([1.0, 1, -1, 1])}, "a reflection"),
-    ({"pose": np.diag([2.0, 2, 2, 1])}, "scaled by 2"),
-    ({"viewmat": np.eye(3)}, "9 numbers"),
-    ({"viewmat": np.eye(4), "K": np.eye(4)}, r"K has shape \(4, 4\)"),
-    ({"viewmat": np.eye(4), "K": -np.eye(3)}, "not a matrix of intrinsics"),
-    ({"viewmat": np.eye(4), "width": 0}, "0x480 pixels"),
-    ({"viewmat": np.eye(4), "opengl": True}, "opengl is about"),
+@pytest.mark.parametrize(("arguments", "facts"), [
+    ({}, ["viewmat", "pose"]),
+    ({"viewmat": np.eye(4), "pose": np.eye(4)}, ["viewmat", "pose"]),
+    ({"viewmat": 2 * np.eye(4)}, ["viewmat", "rigid"]),
+    ({"viewmat": np.diag([1.0, 1, -1, 1])}, ["reflection"]),
+    ({"pose": np.diag([2.0, 2, 2, 1])}, ["pose", 2]),
+    ({"viewmat": np.eye(3)}, [9]),
+    ({"viewmat": np.eye(4), "K": np.eye(4)}, ["K", "(4, 4)"]),
+    ({"viewmat": np.eye(4), "K": -np.eye(3)}, ["K", "intrinsics"]),
+    ({"viewmat": np.eye(4), "width": 0}, ["0x480"]),
+    ({"viewmat": np.eye(4), "opengl": True}, ["opengl"]),
 ])
-def test_what_is_no_camera_is_refused(arguments: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+def test_what_is_no_camera_is_refused(arguments: dict, facts: list) -> None:
+    with raises(InputError, *facts):
         make_camera(**{"K": K, "width": 640, "height": 480, **arguments})
-    assert caught.value.hint
 
 
 @pytest.mark.parametrize("arguments", [

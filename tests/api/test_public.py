@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from facts import raises
 
 from recon_cli import api
 
@@ -56,7 +57,7 @@ def test_every_name_is_there_and_explains_itself() -> None:
         item = getattr(api, name)
         assert item.__doc__, name
         assert name in dir(api)
-    with pytest.raises(AttributeError, match="no attribute 'rendre'"):
+    with raises(AttributeError, "rendre"):
         api.rendre  # noqa: B018
 
 

@@ -78,22 +78,21 @@ def test_pixels_under_a_mask_do_not_matter(tmp_path) -> None:
     assert evaluate(spoiled, TRUTHS, masks=tmp_path / "masks").views == scores.views
 
 
-@pytest.mark.parametrize(("renders", "truths", "message"), [
-    (RENDERS[:2], TRUTHS, "3 truths"),
-    ({"a": RENDERS[0]}, {"b": TRUTHS[0]}, "1 renders have no truth: a; 1 truths have no render: b"),
-    ([RENDERS[0][:-1]], [TRUTHS[0]], "30x23 pixels, the truth 30x24"),
-    ([255 * RENDERS[0]], [TRUTHS[0]], "has values around"),
-    ([RENDERS[0]], [TRUTHS[0].astype(np.float32)], "truths, 0 has values around"),
-    ([RENDERS[0].transpose(2, 0, 1)], [TRUTHS[0]], r"has shape \(3, 24, 30\)"),
-    ([np.full((24, 30, 3), np.nan)], [TRUTHS[0]], "not finite"),
-    ([RENDERS[0][:5, :5]], [TRUTHS[0][:5, :5]], "SSIM needs 11"),
-    ([np.zeros((24, 30, 3), int)], [TRUTHS[0]], "is of int64"),
-    ([], [], "no renders"),
+@pytest.mark.parametrize(("renders", "truths", "facts"), [
+    (RENDERS[:2], TRUTHS, ["2 renders", "3 truths"]),
+    ({"a": RENDERS[0]}, {"b": TRUTHS[0]}, ["a", "b", 1]),
+    ([RENDERS[0][:-1]], [TRUTHS[0]], ["30x23", "30x24"]),
+    ([255 * RENDERS[0]], [TRUTHS[0]], ["renders", 0, "values"]),
+    ([RENDERS[0]], [TRUTHS[0].astype(np.float32)], ["truths", 0, "values"]),
+    ([RENDERS[0].transpose(2, 0, 1)], [TRUTHS[0]], ["(3, 24, 30)"]),
+    ([np.full((24, 30, 3), np.nan)], [TRUTHS[0]], ["finite"]),
+    ([RENDERS[0][:5, :5]], [TRUTHS[0][:5, :5]], ["SSIM", 11]),
+    ([np.zeros((24, 30, 3), int)], [TRUTHS[0]], ["int64"]),
+    ([], [], ["renders"]),
 ])
-def test_what_cannot_be_compared_is_named(renders, truths, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+def test_what_cannot_be_compared_is_named(renders, truths, facts: list) -> None:
+    with raises(InputError, *facts):
         evaluate(renders, truths)
-    assert caught.value.hint
 
 
 def test_masks_that_do_not_fit_are_named() -> None:
@@ -107,14 +106,15 @@ def test_masks_that_do_not_fit_are_named() -> None:
 
 def test_files_that_would_be_misread_are_refused(tmp_path) -> None:
     save(tmp_path / "truth", TRUTHS[:1])
-    for name, content in (("clear", np.zeros((24, 30, 4), np.uint8)), ("damaged", None)):
+    for name, content, fact in (("clear", np.zeros((24, 30, 4), np.uint8), "transparent"),
+                                ("damaged", None, "damaged/view0.png")):
         folder = tmp_path / name
         folder.mkdir()
         if content is None:
             (folder / "view0.png").write_bytes(b"not an image")
         else:
             cv2.imwrite(str(folder / "view0.png"), content)
-        with pytest.raises(InputError, match=r"transparent|cannot be read"):
+        with raises(InputError, fact):
             evaluate(folder, tmp_path / "truth")
     with raises(InputError):
         evaluate(tmp_path / "none", tmp_path / "truth")

@@ -74,20 +74,19 @@ def test_an_opacity_at_the_border_stays_finite(opacity: float) -> None:
     assert splats.opacities.item() == pytest.approx(opacity, abs=1e-6)
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"quats": [[1.0, 0, 0]]}, r"quats has shape \(1, 3\), needed \(1, 4\)"),
-    ({"means": 5.0}, r"means has shape \(\)"),
-    ({"sh": np.zeros((1, 5, 3))}, r"sh has shape \(1, 5, 3\)"),
-    ({"scales": [[0.1, 0.0, 0.1]]}, "scales holds 0, needed are values above 0"),
-    ({"opacities": [-2.0]}, "opacities goes from -2"),
-    ({"means": [[np.nan, 0, 0]]}, "means holds a value that is not finite"),
-    ({"means": torch.zeros(1, 3, dtype=torch.float64)}, "several types"),
-    ({"quats": [["a"]]}, "quats is not an array of numbers"),
+@pytest.mark.parametrize(("changes", "facts"), [
+    ({"quats": [[1.0, 0, 0]]}, ["quats", "(1, 3)", "(1, 4)"]),
+    ({"means": 5.0}, ["means", "()"]),
+    ({"sh": np.zeros((1, 5, 3))}, ["sh", "(1, 5, 3)"]),
+    ({"scales": [[0.1, 0.0, 0.1]]}, ["scales", 0]),
+    ({"opacities": [-2.0]}, ["opacities", -2]),
+    ({"means": [[np.nan, 0, 0]]}, ["means", "finite"]),
+    ({"means": torch.zeros(1, 3, dtype=torch.float64)}, ["types"]),
+    ({"quats": [["a"]]}, ["quats", "array"]),
 ])
-def test_values_that_cannot_be_used_are_named(changes: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+def test_values_that_cannot_be_used_are_named(changes: dict, facts: list) -> None:
+    with raises(InputError, *facts):
         one_gaussian(**changes)
-    assert caught.value.hint
 
 
 @pytest.mark.parametrize("name", WRITTEN)

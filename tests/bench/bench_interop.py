@@ -22,7 +22,7 @@ from recon_cli.scene.splats import Splats, with_rows
 from recon_cli.splats.compressed_ply import write_compressed_ply
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.splats.registry import FORMATS
-from recon_cli.splats.splat import read_splat, write_splat
+from recon_cli.splats.splat import FORMAT, write_splat
 from recon_cli.splats.spz import write_spz
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -31,7 +31,7 @@ from splat_cases import edge_splats, greatest, rotation_error
 Write, Read = Callable[[Path, Splats], None], Callable[[Path], Splats]
 OURS: list[tuple[str, Write, Read]] = [
     ("a.ply", write_ply, read_ply),
-    ("a.splat", write_splat, read_splat),
+    ("a.splat", write_splat, FORMAT.read),
     ("3.spz", write_spz, FORMATS["spz"].read),
     ("4.spz", partial(write_spz, version=4), FORMATS["spz"].read),
     ("a.compressed.ply", write_compressed_ply, FORMATS["compressed.ply"].read),

@@ -33,7 +33,8 @@ from recon_cli.train.fit.initialize import first_state
 from recon_cli.train.fit.loop import fit
 from recon_cli.train.fit.schedule import make_schedule
 from recon_cli.train.fit.train_data import load_task, load_views
-from recon_cli.trust.error_model import PRIOR, TERMS, picture_terms
+from recon_cli.trust.error_model import picture_terms
+from recon_cli.trust.records import PRIOR, TERMS
 from recon_cli.trust.scene_trust import measure_trust
 from recon_cli.trust.support import error_image
 

@@ -23,6 +23,7 @@ from colour_formulas import (
     to_primaries,
     to_signals,
 )
+from facts import assert_facts
 from media import (
     set_display_matrix,
     spoil_packets,
@@ -428,7 +429,8 @@ def test_one_frame_comes_out_for_each_that_goes_in(tmp_path, count):
 def test_times_and_indices_stay_in_the_scan_and_after_it(video):
     scan = scan_video(video, threads=2, step=lambda: None)
     np.testing.assert_allclose(scan.seconds, np.arange(COUNT) / RATE)
-    assert scan.notices == ("fields.mp4 is interlaced: 10 frames are deinterlaced.",)
+    (notice,) = scan.notices
+    assert_facts(notice, "fields.mp4", "interlaced", COUNT)
     for index, rgb in frames_at(video, [0, 3, COUNT - 1], threads=2):
         assert np.flatnonzero(rgb[48, :, 1] > 130)[0] == 8 + 2 * STEP * index
 

@@ -161,7 +161,8 @@ def test_what_is_not_applied_is_said_and_damage_changes_nothing(tmp_path):
                        gain_map(np.ones((2, 2, 1))))})
     found = read_corrections(path)
     assert len(found.left_out) == 2
-    assert sum("not applied" in text for text in describe_corrections([found])) == 2
+    said = describe_corrections([found])
+    assert all(any(one in text for text in said) for one in found.left_out)
     damaged = opcodes(gain_map(np.ones((2, 2, 1))))[:-5]
     picture, path = develop_light(tmp_path, light, more={BEFORE: damaged})
     assert not read_corrections(path).gains

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from facts import assert_facts, raises
+from facts import raises
 from media import texture
 
 from recon_cli.capture.frame_measures import (
@@ -50,15 +50,11 @@ def test_frames_that_are_clipped_for_the_most_part_are_not_well_exposed():
     assert has_content(found).tolist() == [True, True, True, False]
 
 
-@pytest.mark.parametrize(("value", "words"), [
-    (3, "too dark: 20 of its 20"), (255, "over-exposed: 20 of its 20"),
-    (128, "flat: 20 of its 20")])
-def test_a_capture_that_shows_nothing_is_refused_with_what_is_wrong(value, words):
+@pytest.mark.parametrize(("value", "fault"), [(3, "dark"), (255, "over-exposed"), (128, "flat")])
+def test_a_capture_that_shows_nothing_is_refused_with_what_is_wrong(value, fault):
     frames = rows(*[np.full((96, 160), value, np.uint8)] * 20)
-    with pytest.raises(InputError, match=words) as caught:
+    with raises(InputError, "room.mp4", fault, 20, 3):
         check_exposure("room.mp4", frames, least=3)
-    assert_facts(caught.value.message, 3)
-    assert "ecord again" in caught.value.hint
 
 
 def test_a_few_frames_that_show_something_are_enough():

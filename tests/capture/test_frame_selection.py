@@ -183,9 +183,8 @@ def test_a_dim_stretch_is_bridged_but_a_black_one_is_not():
 
 
 def test_a_camera_that_does_not_move_is_refused():
-    with raises(InputError, "room.mp4", 50) as caught:
+    with raises(InputError, "room.mp4", 50):
         check_motion("room.mp4", np.zeros(50))
-    assert "walk sideways" in caught.value.hint
 
 
 def test_twelve_adjacent_frames_are_warned_of():
@@ -252,9 +251,9 @@ def test_what_is_left_out_is_named():
     found = choose(pictures)
     assert reasons(found)["broken"] is Reason.DAMAGED
     assert reasons(found)["cap"] is Reason.CLIPPED
-    assert describe_dropped(found) == [
-        "1 photos are left out because others show the same: copy (like b).",
-        "1 photos are left out because they are black, blown out or flat: cap."]
+    repeats, clipped = describe_dropped(found)
+    assert_facts(repeats, 1, "copy (like b)")
+    assert_facts(clipped, 1, "black", "cap")
 
 
 def test_many_names_are_cut_short():

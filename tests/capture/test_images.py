@@ -321,12 +321,12 @@ def test_what_is_no_picture_is_refused(tmp_path, content):
         inspect_photo(tmp_path / "a.jpg")
 
 
-@pytest.mark.parametrize(("content", "reason"), [
-    (b"", "it is empty"), (b"no picture", "it is not a picture of a known format")])
+@pytest.mark.parametrize(("content", "reason"), [(b"", "empty"), (b"no picture", "format")])
 def test_a_file_that_is_no_picture_is_refused_in_plain_words(tmp_path, content, reason):
     (tmp_path / "a.jpg").write_bytes(content)
-    with pytest.raises(InputError, match=f"^a.jpg cannot be read: {reason}[^/]*$"):
+    with raises(InputError, "a.jpg", reason) as caught:
         inspect_photo(tmp_path / "a.jpg")
+    assert "/" not in caught.value.message
 
 
 def test_floating_point_colours_are_refused_too(tmp_path):

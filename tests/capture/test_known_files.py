@@ -69,8 +69,8 @@ def test_files_without_text_are_recognised_too(tmp_path):
         database.execute("CREATE TABLE Node (id INTEGER)")
         database.execute("CREATE TABLE Link (id INTEGER)")
     database.close()
-    assert [found.row.words for found in find_foreign(tmp_path)] == [
-        "a database of RTAB-Map", "the cameras of an LLFF scene"]
+    for found, name in zip(find_foreign(tmp_path), ("RTAB-Map", "LLFF"), strict=True):
+        assert_facts(found.row.words, name)
 
 
 def test_the_command_that_converts_it_names_its_file(tmp_path):
@@ -110,8 +110,9 @@ def test_a_file_is_recognised_by_itself(tmp_path):
     put(tmp_path / "cameras.json", "[]")
     put(tmp_path / "odometry walk.mp4", "")
     found = [recognise_file(path) for path in sorted(tmp_path.iterdir())]
-    assert [one and one.row.words for one in found] == [
-        "the cameras of Agisoft Metashape", "camera poses, by its name", None]
+    for one, name in zip(found, ("Metashape", "poses"), strict=False):
+        assert name in one.row.words
+    assert found[2] is None
 
 
 def test_a_text_that_lists_the_pictures_is_found_whoever_wrote_it(tmp_path):

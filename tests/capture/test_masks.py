@@ -112,7 +112,7 @@ def test_a_mask_that_ignores_everything_is_refused_with_its_brightest_value(tmp_
 
 def test_a_mask_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"^The mask a\.png cannot be read"):
+    with raises(InputError, "mask", "a.png"):
         read_mask(tmp_path / "a.png", 8, 6)
 
 

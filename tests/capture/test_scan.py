@@ -255,23 +255,23 @@ def test_hdr_is_named_with_its_kind(tmp_path):
     for name, trc in (("HLG", HLG), ("PQ", PQ)):
         path = write_luma(
             tmp_path / f"{name}.mp4", [luma] * 3, trc=trc, primaries=BT2020, colorspace=BT2020)
-        assert notices(path) == (
-            f"{name}.mp4 is {name} video: tone-mapped to SDR by one curve.",)
+        (notice,) = notices(path)
+        assert_facts(notice, f"{name}.mp4", name, "SDR")
 
 
 @pytest.mark.parametrize(("primaries", "name"), [(9, "BT.2020"), (12, "Display P3")])
 def test_a_wide_gamut_of_sdr_is_named(tmp_path, primaries, name):
     path = write_luma(tmp_path / "a.mp4", [np.full((64, 96), 500)] * 3, primaries=primaries)
-    assert notices(path) == (f"a.mp4 has colours of {name}: converted to sRGB.",)
+    (notice,) = notices(path)
+    assert_facts(notice, "a.mp4", name, "sRGB")
 
 
 def test_a_mirrored_video_is_named_and_a_turned_one_is_not(tmp_path):
     path = write_video(tmp_path / "a.mp4", [texture(64, 96)] * 3)
     data = path.read_bytes()
     set_display_matrix(path, (-65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30))
-    assert notices(path) == (
-        "a.mp4 is mirrored as its display matrix says; if players show writing in it reversed, the "
-        "scene is reversed, too.",)
+    (notice,) = notices(path)
+    assert_facts(notice, "a.mp4", "mirrored")
     path.write_bytes(data)
     set_display_matrix(path, (-65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30))
     assert notices(path) == ()
@@ -283,8 +283,8 @@ def test_ten_bits_of_sdr_give_no_notice(tmp_path):
 
 def test_stretched_pixels_are_named_with_both_sizes(tmp_path):
     path = write_video(tmp_path / "dv.mp4", [texture(64, 90)] * 3, aspect=Fraction(16, 15))
-    assert notices(path) == (
-        "dv.mp4 has pixels of aspect 16/15: its frames of 90x64 are stretched to 96x64.",)
+    (notice,) = notices(path)
+    assert_facts(notice, "dv.mp4", "16/15", "90x64", "96x64")
 
 
 def test_a_second_video_in_the_file_is_named(tmp_path):
@@ -296,7 +296,8 @@ def test_a_second_video_in_the_file_is_named(tmp_path):
         for stream in streams:
             frame = av.VideoFrame.from_ndarray(texture(64, stream.width))
             container.mux([*stream.encode(frame), *stream.encode()])
-    assert notices(path) == ("two.mkv holds 2 videos: the first that can be decoded is used.",)
+    (notice,) = notices(path)
+    assert_facts(notice, "two.mkv", 2)
     assert scan_video(path, threads=1, step=lambda: None).width == 96
 
 

@@ -175,7 +175,7 @@ def test_frame_packing_in_the_stream_gives_the_left_view(tmp_path, packing, axis
     assert abs(float(picture.gray().mean()) - 200) < 4
     scan = scan_video(path, threads=1, step=lambda: None)
     assert (scan.width, scan.height) == (160, 96)
-    assert "left eye" in scan.notices[0]
+    assert "left" in scan.notices[0]
     refuse_unusable(path, "auto")
 
 

@@ -12,9 +12,22 @@ import pytest
 from facts import assert_facts
 from fake_stages import NAMES
 
-from recon_cli import __version__
+from recon_cli import __version__, errors
 from recon_cli.cli import VERBS, cli, main
 from recon_cli.commands import jobs, stages, workspace
+from recon_cli.errors import (
+    BackendError,
+    ConfigError,
+    FormatError,
+    InputError,
+    ManifestError,
+    ReconError,
+    ReconstructionError,
+    SfmError,
+    StageError,
+    TrainingError,
+    WorkspaceError,
+)
 from recon_cli.pipeline import plan
 from recon_cli.pipeline.plan import StageStatus
 from recon_cli.train.plan import QUALITIES
@@ -131,10 +144,11 @@ def test_train_prune_branches_off_in_the_middle() -> None:
 
 def test_the_compact_model_alone_needs_pruning(capsys: Said) -> None:
     assert main(["run", "room.mp4", "--compact-only", "--no-prune"]) == 2
-    assert main(["train", "--compact-only"]) == 2
-    assert_facts(capsys.readouterr().err, "--compact-only", "--prune")
+    assert_facts(capsys.readouterr().err, "--compact-only", "--no-prune")
     assert main(["run", "room.mp4", "--compact-only"]) == 0
     assert config_of("train")["compact_only"] is True
+    Path("workspace/recon.toml").write_text("[train]\ncompact_only = true\n")
+    assert main(["run", "room.mp4", "--no-prune"]) == 2
 
 
 def test_pruning_options_without_prune_are_a_usage_error(capsys: Said) -> None:
@@ -203,7 +217,7 @@ def test_status_as_json_has_stable_keys(capsys: Said) -> None:
 
 def test_status_needs_no_workspace_and_makes_none(capsys: Said) -> None:
     assert main(["status", "-w", "none"]) == 0
-    assert "no workspace at" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, Path("none").absolute())
     assert not Path("none").exists()
 
 
@@ -216,9 +230,9 @@ def test_status_says_that_an_input_is_gone(capsys: Said) -> None:
 
 def test_a_missing_stage_is_4_and_names_the_command(capsys: Said) -> None:
     assert main(["train"]) == 4
-    assert capsys.readouterr().err == (
-        "error: train needs ingest, which is missing.\n"
-        "hint: Run `recon ingest VIDEO` first.\n")
+    error, hint = capsys.readouterr().err.splitlines()
+    assert_facts(error, "error:", "train", "ingest")
+    assert_facts(hint, "hint:", "recon ingest VIDEO")
 
 
 def test_a_missing_input_is_3(capsys: Said) -> None:
@@ -273,22 +287,37 @@ def _raise(error: BaseException) -> None:
     raise error
 
 
-@pytest.mark.parametrize(("error", "code", "said"), [
-    (KeyboardInterrupt(), 130, "interrupted; run the same command again to resume"),
-    (OSError(errno.ENOSPC, "No space left"), 7, "MB free"),
-    (OSError(errno.EFBIG, "File too large"), 7, "larger than"),
-    (PermissionError(errno.EACCES, "Permission denied"), 7, "not writable"),
-    (ZeroDivisionError("by zero"), 1, "error: ZeroDivisionError: by zero"),
+CODES: dict[type[ReconError], int] = {
+    ConfigError: 2, InputError: 3, FormatError: 3, StageError: 4, ReconstructionError: 5,
+    SfmError: 5, TrainingError: 5, BackendError: 6, WorkspaceError: 7, ManifestError: 7}
+
+
+def test_every_class_of_errors_has_its_exit_code_here() -> None:
+    assert CODES.keys() == {item for item in vars(errors).values() if isinstance(item, type)
+                            and issubclass(item, ReconError) and item is not ReconError}
+
+
+@pytest.mark.parametrize(("error", "code", "facts"), [
+    *((kind("28.jpg is dark.", hint="Type this."), code, ["error:", "28.jpg"])
+      for kind, code in CODES.items()),
+    (KeyboardInterrupt(), 130, ["interrupted", "again"]),
+    (OSError(errno.ENOSPC, "No space left"), 7, ["error:", "MB"]),
+    (OSError(errno.EFBIG, "File too large"), 7, ["error:", "larger"]),
+    (PermissionError(errno.EACCES, "Permission denied"), 7, ["error:", "writable"]),
+    (ZeroDivisionError("by zero"), 1, ["error:", "ZeroDivisionError", "zero"]),
 ])
 def test_what_a_stage_raises_becomes_an_exit_code(
-    error: BaseException, code: int, said: str, capsys: Said
+    error: BaseException, code: int, facts: list[str], capsys: Said
 ) -> None:
     fake_stages.actions["ingest"] = lambda: _raise(error)
     assert main(["ingest", "room.mp4"]) == code
     err = capsys.readouterr().err
-    assert said in err
+    assert_facts(err, *facts)
     assert "Traceback" not in err
-    assert "Traceback" in Path("workspace/recon.log").read_text()
+    if isinstance(error, ReconError):
+        assert_facts(err, "hint:", "Type this.")
+    else:
+        assert "Traceback" in Path("workspace/recon.log").read_text()
     del fake_stages.actions["ingest"]
     assert main(["ingest", "room.mp4"]) == 0
 
@@ -310,7 +339,7 @@ def test_clean_keeps_every_finished_result_fresh(
     assert Path("workspace/.partial/train").is_dir()
     capsys.readouterr()
     assert main(["clean", "--dry-run"]) == 0
-    assert "would be freed" in capsys.readouterr().out
+    assert_facts(capsys.readouterr().out, "MB")
     assert Path("workspace/.partial/train").is_dir()
     assert main(["clean"]) == 0
     assert "database.db" in capsys.readouterr().out
@@ -331,7 +360,7 @@ def test_clean_removes_the_results_of_named_stages(capsys: Said) -> None:
     main(["run", "room.mp4"])
     capsys.readouterr()
     assert main(["clean", "train", "prune"]) == 0
-    assert "MB freed" in capsys.readouterr().out
+    assert_facts(capsys.readouterr().out, "MB")
     assert not Path("workspace/train").exists()
     assert [states()[NAMES.index(name)] for name in ("sfm", "train", "prune")] == [
         "fresh", "missing", "missing"]
@@ -353,7 +382,7 @@ def test_doctor_prints_text_and_json(capsys: Said) -> None:
 
 def test_the_version_is_printed(capsys: Said) -> None:
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"recon, version {__version__}\n"
+    assert_facts(capsys.readouterr().out, "recon", __version__)
 
 
 @pytest.mark.parametrize("verb", VERBS)

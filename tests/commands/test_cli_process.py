@@ -49,8 +49,9 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert process.stderr
     process.stdout.close()
     said = process.stderr.read()
-    assert not said or said.endswith(
-        f" notice: no workspace at {Path('workspace').absolute()} yet\n")
+    if said:
+        (line,) = said.splitlines()
+        assert_facts(line, "notice:", Path("workspace").absolute())
     process.wait()
 
 
@@ -88,7 +89,7 @@ def test_the_generated_reference_holds_every_verb_and_tells_when_it_is_out_of_da
     generator = _generator()
     monkeypatch.setattr(generator, "PATH", Path("cli.md").absolute())
     assert generator.main(["--check"]) == 1
-    assert "out of date" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "cli.md")
     assert generator.main([]) == 0
     assert generator.main(["--check"]) == 0
     text = Path("cli.md").read_text()

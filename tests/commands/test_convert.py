@@ -56,4 +56,4 @@ def test_info_prints_lines_or_json_and_reads_on_after_a_damaged_file(
     assert main(["info", "bad.ply", "a.ply", "--json"]) == 3
     printed = capsys.readouterr()
     assert [item["gaussians"] for item in json.loads(printed.out)] == [40]
-    assert "error: bad.ply" in printed.err
+    assert_facts(printed.err, "error:", "bad.ply")

@@ -98,7 +98,7 @@ def test_a_value_out_of_type_range_or_choice_is_a_usage_error(words: tuple[str, 
 def test_a_field_with_flags_gets_one_flag_for_each_other_choice() -> None:
     assert parsed(DenoiseConfig, "--force") == {"mode": "force"}
     assert parsed(DenoiseConfig, "--off") == {"mode": "off"}
-    with pytest.raises(click.UsageError, match="exclude each other"):
+    with raises(click.UsageError, "--off", "--force"):
         parsed(DenoiseConfig, "--off", "--force")
     with pytest.raises(click.UsageError):
         parsed(DenoiseConfig, "--auto")

@@ -1,5 +1,6 @@
 """Which layer wins, and what is said about a setting that does not exist."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -93,35 +94,35 @@ def test_a_wrong_assignment_says_what_was_needed(text: str, said: str) -> None:
 
 def test_every_section_is_checked_not_only_the_one_that_is_used() -> None:
     layers.check({"ingest": {"max_size": 100}})
-    with raises(ConfigError, "at most", 1):
+    with raises(ConfigError, "ratio", 2.0, 1):
         layers.check({"prune": {"ratio": 2.0}})
     with raises(ConfigError, "type"):
         layers.check({"train": {"iterations": "many"}})
 
 
-@pytest.mark.parametrize(("value", "said"), [
-    (["a.png", "b.png"], "3 values"),
-    ("a.png b.png 2", "3 values"),
-    (["a.png", "b.png", "2"], "3 values"),
-    (["a.png", "b.png", True], "3 values"),
-    (["a.png", "b.png", float("nan")], "3 values"),
-    (["a.png", 3, 2.0], "3 values"),
-    (["a.png", "a.png", 2.0], "two different places"),
-    (["a.png", " ", 2.0], "two different places"),
-    (["a.png", "b.png", 0], "more than 0"),
-    (["a.png", "b.png", -1.0], "more than 0"),
+@pytest.mark.parametrize(("value", "fact"), [
+    (["a.png", "b.png"], 3),
+    ("a.png b.png 2", 3),
+    (["a.png", "b.png", "2"], 3),
+    (["a.png", "b.png", True], 3),
+    (["a.png", "b.png", float("nan")], 3),
+    (["a.png", 3, 2.0], 3),
+    (["a.png", "a.png", 2.0], "places"),
+    (["a.png", " ", 2.0], "places"),
+    (["a.png", "b.png", 0], 0),
+    (["a.png", "b.png", -1.0], 0),
 ])
 @pytest.mark.parametrize("config", [SfmConfig, ExportConfig])
 def test_a_measurement_that_measures_nothing_is_refused(
-    config: type[SfmConfig | ExportConfig], value: object, said: str
+    config: type[SfmConfig | ExportConfig], value: object, fact: object
 ) -> None:
-    with pytest.raises(ConfigError, match=said):
+    with raises(ConfigError, "scale_between", fact):
         config(scale_between=value)  # type: ignore[arg-type]
 
 
 def test_a_whole_number_that_no_library_holds_is_refused() -> None:
     for value in (2**31, -(2**31), 10**26):
-        with pytest.raises(ConfigError, match=r"seed is|at most 2147483647") as raised:
+        with raises(ConfigError, "seed") as raised:
             SfmConfig(seed=value)
         assert len(raised.value.message) < 200
     assert SfmConfig(seed=2**31 - 1).seed == 2**31 - 1
@@ -131,12 +132,10 @@ def test_build_ignores_other_sections() -> None:
     assert layers.build(IngestConfig, {"train": {"iterations": 3}}) == IngestConfig()
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"segments": "many"}, "segments is 'many', but needs auto, off or a number"),
-    ({"segments": "0"}, "segments is '0'"),
-    ({"segments": "3", "pairs": "exhaustive"}, "segments is 3 and pairs is exhaustive")])
-def test_segments_that_cannot_be_are_refused(options: dict[str, str], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+@pytest.mark.parametrize("options", [
+    {"segments": "many"}, {"segments": "0"}, {"segments": "3", "pairs": "exhaustive"}])
+def test_segments_that_cannot_be_are_refused(options: dict[str, str]) -> None:
+    with raises(ConfigError, *options, *options.values()):
         SfmConfig(**options)  # type: ignore[arg-type]
 
 
@@ -157,9 +156,9 @@ def test_options_that_are_gone_may_ask_for_what_is_done_anyway(text, left, tmp_p
 def test_options_that_are_gone_are_refused_where_they_ask_for_more(text, tmp_path):
     path = tmp_path / "recon.toml"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"does not exist|no longer has") as caught:
+    section, key = re.findall(r"\w+", text)[:2]
+    with raises(ConfigError, "merge" if section == "merge" else f"{section}.{key}"):
         layers.read_settings(path)
-    assert caught.value.hint
 
 
 def test_options_are_read_by_the_names_that_an_earlier_version_wrote(tmp_path):

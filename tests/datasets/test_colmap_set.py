@@ -181,8 +181,7 @@ def test_of_several_models_the_largest_is_read_and_the_others_are_said(folder):
     posed = read_colmap(folder)
     assert len(posed.images) == 10
     (notice,) = posed.notices
-    assert_facts(notice, "sparse/1 with 10 images", "of 3 models", "sparse/0 has 6",
-                 "sparse/10 has 4")
+    assert_facts(notice, "sparse/1", 10, 3, "sparse/0", 6, "sparse/10", 4)
 
 
 def test_a_model_among_several_may_be_named_itself(folder):

@@ -110,24 +110,6 @@ def test_a_gap_of_motion_capture_gives_no_pose(tmp_path):
     assert [image.name for image in read_tum(folder).images] == ["0.png", "2.png"]
 
 
-@pytest.mark.parametrize(("name", "text", "message"), [
-    ("rgb.txt", "10.0 /etc/passwd\n", "outside"),
-    ("rgb.txt", "10.0 ../a.png\n", "outside"),
-    ("rgb.txt", "", "lists no files"),
-    ("rgb.txt", "soon rgb/0.png\n", "rgb.txt"),
-    ("groundtruth.txt", "", "no path"),
-    ("groundtruth.txt", "10 0 0 0 0 0 0\n", "line 1"),
-    ("groundtruth.txt", "10 0 0 0 0 0 0 0\n11 0 0 0 0 0 0 1\n", "no path"),
-    ("groundtruth.txt", "10 0 0 nan 0 0 0 1\n11 0 0 0 0 0 0 1\n", "not finite"),
-    ("depth.txt", "10.0\n", "line 1"),
-])
-def test_damaged_lists_are_refused(tmp_path, name, text, message):
-    folder = posed_sets.make_tum(tmp_path)
-    (folder / name).write_text(text)
-    with pytest.raises(FormatError, match=message):
-        read_tum(folder)
-
-
 def write_path(folder, times, places):
     """Writes groundtruth.txt with the poses of some places of the walk."""
     lines = []
@@ -174,4 +156,4 @@ def test_between_poses_the_usual_interval_tells_a_gap(tmp_path, interval, count)
     posed = read_tum(folder)
     assert len(posed.images) == count
     assert "4.png" not in [image.name for image in posed.images]
-    assert any(f"left out: {10 - count} frame" in notice for notice in posed.notices)
+    assert_facts("\n".join(posed.notices), "left", 10 - count)

@@ -73,20 +73,14 @@ def test_depth_is_read_however_it_lies_in_its_file(photos, depths, tmp_path, mor
         assert np.percentile(off, 90) < 0.06
 
 
-def test_depth_of_a_walk_without_motion_is_left(photos, depths, tmp_path):
-    quest(tmp_path, photos[:3], eyes=("left",))
-    write_depth(tmp_path, depths[:1])
+@pytest.mark.parametrize(("frames", "maps", "late_ms"), [
+    pytest.param(3, 1, 0, id="without motion"), pytest.param(20, 20, 100_000, id="another time")])
+def test_depth_that_fits_no_frame_is_left(photos, depths, tmp_path, frames, maps, late_ms):
+    quest(tmp_path, photos[:frames], eyes=("left",))
+    write_depth(tmp_path, depths[:maps], late_ms=late_ms)
     posed = read_posed(tmp_path)
     assert not any(image.depth for image in posed.images)
-    assert_facts("\n".join(posed.notices), 3, "depth", "frames")
-
-
-def test_depth_of_another_time_is_left(photos, depths, tmp_path):
-    quest(tmp_path, photos, eyes=("left",))
-    write_depth(tmp_path, depths, late_ms=100_000)
-    posed = read_posed(tmp_path)
-    assert not any(image.depth for image in posed.images)
-    assert_facts("\n".join(posed.notices), 20, "depth", "frames")
+    assert_facts("\n".join(posed.notices), frames, "depth", "frames")
 
 
 def test_rows_without_a_camera_and_files_cut_short_are_counted(photos, depths, tmp_path):

@@ -1,7 +1,7 @@
 import numpy as np
 import posed_sets
 import pytest
-from facts import raises
+from facts import assert_facts, raises
 
 from recon_cli.datasets.rgbd import read_scannet
 from recon_cli.errors import FormatError, InputError
@@ -16,7 +16,8 @@ def test_frames_come_in_the_order_of_their_numbers_without_lost_ones(tmp_path):
     posed = read_scannet(posed_sets.make_scannet(tmp_path, frames=12, lost=(1, 3)))
     assert [image.name for image in posed.images] == [
         f"{number}.jpg" for number in (0, 2, *range(4, 12))]
-    assert posed.notices == ("left out: 2 frames whose tracking was lost, the first is 1.jpg",)
+    (notice,) = posed.notices
+    assert_facts(notice, 2, "1.jpg")
     assert (posed.metric, posed.sequence, posed.splits) == (True, True, False)
 
 
@@ -58,24 +59,9 @@ def test_a_scene_without_depth_is_read_without(folder):
     assert all(image.depth is None for image in read_scannet(folder).images)
 
 
-def test_missing_intrinsics_are_named(folder):
-    (folder / "intrinsic" / "intrinsic_color.txt").unlink()
-    with raises(FormatError, "intrinsic_color.txt"):
-        read_scannet(folder)
-
-
 def test_intrinsics_for_images_of_another_size_are_refused(folder):
     K = np.loadtxt(folder / "intrinsic" / "intrinsic_color.txt")
     K[:2] *= 2
     np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", K)
     with raises(FormatError, "size"):
-        read_scannet(folder)
-
-
-@pytest.mark.parametrize(("text", "said"), [
-    ("1 2 3", "has 3 numbers"), ("a " * 16, "something other"), ("nan " * 16, "not finite"),
-    ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", "scaled by 2")])
-def test_a_damaged_pose_is_named(folder, text, said):
-    (folder / "pose" / "2.txt").write_text(text)
-    with pytest.raises(FormatError, match=rf"2\.txt.*{said}"):
         read_scannet(folder)

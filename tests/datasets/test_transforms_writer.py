@@ -70,7 +70,7 @@ def test_held_out_views_stay_held_out(tmp_path):
 @pytest.mark.parametrize("name", ["/a.png", "../a.png", "images/../../a.png"])
 def test_a_path_that_leaves_the_folder_is_refused(tmp_path, name):
     ((_, camera),) = made(tmp_path, 1)
-    with pytest.raises(ValueError, match="not a path below"):
+    with raises(ValueError, name):
         write_transforms(tmp_path / "transforms.json", [(name, camera)])
     assert not (tmp_path / "transforms.json").exists()
 

@@ -97,24 +97,24 @@ def test_only_the_recipe_of_3dgs_is_the_reference(changes, expected):
     assert RunConfig(**{**plain, **changes}).is_reference is expected
 
 
+def metrics_of(**more):
+    return Metrics(
+        models=dict(zip(("base", "pruned"), scores().values(), strict=True)), psnr_convention="",
+        psnr_8bit_convention="", ssim_convention="", ssim_padded_convention="",
+        lpips_convention="", truth_digest="", width=1, height=1, test_views=2,
+        unregistered_test=(), **more)
+
+
 @pytest.mark.parametrize(("recipe", "labels"), [
     (REFERENCE, ["3DGS", "compact"]), (None, ["original", "compact"])])
 def test_tables_name_a_base_model_3dgs_only_where_it_was_trained_so(recipe, labels):
-    named = dict(zip(("base", "pruned"), scores().values(), strict=True))
-    metrics = Metrics(
-        models=named, psnr_convention="", psnr_8bit_convention="", ssim_convention="",
-        ssim_padded_convention="", lpips_convention="", truth_digest="", width=1, height=1,
-        test_views=2, unregistered_test=(), base_recipe=recipe)
+    metrics = metrics_of(base_recipe=recipe)
     assert [metrics.label(name) for name in metrics.models] == labels
     assert Metrics.from_json(metrics.to_json()).base_recipe == recipe
 
 
 def test_tables_name_the_protocol_that_was_followed():
-    named = dict(zip(("base", "pruned"), scores().values(), strict=True))
-    metrics = Metrics(
-        models=named, psnr_convention="", psnr_8bit_convention="", ssim_convention="",
-        ssim_padded_convention="", lpips_convention="", truth_digest="", width=1, height=1,
-        test_views=2, unregistered_test=(), base_recipe=REFERENCE, protocol="3dgs")
+    metrics = metrics_of(base_recipe=REFERENCE, protocol="3dgs")
     assert [metrics.label(name) for name in metrics.models] == [
         "3DGS (protocol 3dgs)", "compact (protocol 3dgs)"]
     record = metrics.to_json()

@@ -32,7 +32,6 @@ def test_rooms_come_in_the_order_of_the_paper_and_missing_ones_are_named(
     with caplog.at_level(logging.WARNING, "recon"):
         found = find_rooms(tmp_path)
     assert [path.name for path in found] == ["office3", "Room0", "room1"]
-    assert "does not hold" in caplog.text
     for name in TABLE_I:
         assert (name in caplog.text) == (name not in ("office3", "room0", "room1"))
 
@@ -61,18 +60,15 @@ def test_one_room_in_place_of_their_folder_is_recognised(tmp_path: Path) -> None
     assert str(tmp_path) in (caught.value.hint or "")
 
 
-@pytest.mark.parametrize(("lacks", "said"), [("traj.txt", "has no traj.txt"),
-                                             ("results", "has no results/")])
-def test_an_incomplete_room_is_refused_before_anything_runs(
-    tmp_path: Path, lacks: str, said: str
-) -> None:
+@pytest.mark.parametrize("lacks", ["traj.txt", "results"])
+def test_an_incomplete_room_is_refused_before_anything_runs(tmp_path: Path, lacks: str) -> None:
     room(tmp_path / "room0")
     path = room(tmp_path / "room1") / lacks
     if path.is_dir():
         path.rmdir()
     else:
         path.unlink()
-    with pytest.raises(InputError, match=said):
+    with raises(InputError, "room1", lacks):
         find_rooms(tmp_path)
 
 

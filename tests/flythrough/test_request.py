@@ -3,42 +3,43 @@
 from pathlib import Path
 
 import pytest
+from facts import raises
 
 from recon_cli.errors import ConfigError
 from recon_cli.flythrough.request import RenderRequest
 
 BAD = [
-    ({"path": "trainnig"}, "training, orbit, tour or a FILE.json"),
-    ({"fps": 0.0}, "--fps is 0"),
-    ({"fps": float("nan")}, "--fps is nan"),
-    ({"seconds": -1.0}, "--seconds is -1"),
-    ({"fps": 240.0, "seconds": 1000.0}, "240,000 frames"),
-    ({"size": 0}, "at least 1 pixel"),
-    ({"size": 100, "width": 100}, "exclude each other"),
-    ({"background": (0, 256, 0)}, "0 to 255"),
-    ({"path": "a.json", "seconds": 3.0}, "--seconds has no effect"),
-    ({"views": ("test",), "fps": 3.0}, "--fps has no effect"),
-    ({"views": ("test",), "form": "mp4"}, "cannot become a video"),
-    ({"views": ("test",), "width": 8, "height": 8}, "keep their shape"),
-    ({"crf": 20}, "without a video"),
-    ({"codec": "av1"}, "without a video"),
-    ({"crf": 52, "form": "mp4"}, "0 to 51"),
-    ({"crf": -1, "codec": "av1", "form": "mp4"}, "0 to 63"),
-    ({"out": Path("a.mp4"), "form": "png"}, "format is png"),
-    ({"out": Path("a.png"), "form": "mp4"}, "format is mp4"),
-    ({"out": Path("a.mp4"), "outputs": ("rgb", "depth")}, "2 outputs"),
-    ({"out": Path("a.gif"), "form": "webm"}, "format is webm"),
-    ({"out": Path("a.jpg"), "form": "png"}, "format is png"),
-    ({"out": Path("a.webm"), "codec": "h264"}, "holds av1"),
-    ({"out": Path("a.gif"), "crf": 20}, "nor on a .gif"),
-    ({"out": Path("a.xyz")}, r"\.xyz cannot be written"),
-    ({"out": Path("a.png"), "outputs": ("depth",)}, "unit of its depth"),
+    ({"path": "trainnig"}, ["training", "orbit", "tour"]),
+    ({"fps": 0.0}, ["--fps", 0]),
+    ({"fps": float("nan")}, ["--fps", "nan"]),
+    ({"seconds": -1.0}, ["--seconds", -1]),
+    ({"fps": 240.0, "seconds": 1000.0}, ["240,000"]),
+    ({"size": 0}, ["--size", 0, 1]),
+    ({"size": 100, "width": 100}, ["--size", "--width"]),
+    ({"background": (0, 256, 0)}, [255]),
+    ({"path": "a.json", "seconds": 3.0}, ["--seconds"]),
+    ({"views": ("test",), "fps": 3.0}, ["--fps", "single views"]),
+    ({"views": ("test",), "form": "mp4"}, ["video", "views"]),
+    ({"views": ("test",), "width": 8, "height": 8}, ["--width", "--height", "single views"]),
+    ({"crf": 20}, ["--crf", "video"]),
+    ({"codec": "av1"}, ["--codec", "video"]),
+    ({"crf": 52, "form": "mp4"}, ["--crf", 51]),
+    ({"crf": -1, "codec": "av1", "form": "mp4"}, ["--crf", 63]),
+    ({"out": Path("a.mp4"), "form": "png"}, ["a.mp4", "png"]),
+    ({"out": Path("a.png"), "form": "mp4"}, ["a.png", "mp4"]),
+    ({"out": Path("a.mp4"), "outputs": ("rgb", "depth")}, ["a.mp4", 2]),
+    ({"out": Path("a.gif"), "form": "webm"}, ["a.gif", "webm"]),
+    ({"out": Path("a.jpg"), "form": "png"}, ["a.jpg", "png"]),
+    ({"out": Path("a.webm"), "codec": "h264"}, [".webm", "av1", "h264"]),
+    ({"out": Path("a.gif"), "crf": 20}, ["--crf", ".gif"]),
+    ({"out": Path("a.xyz")}, ["a.xyz"]),
+    ({"out": Path("a.png"), "outputs": ("depth",)}, ["a.png", "depth"]),
 ]
 
 
-@pytest.mark.parametrize(("options", "said"), BAD)
-def test_what_cannot_be_is_refused(options, said):
-    with pytest.raises(ConfigError, match=said):
+@pytest.mark.parametrize(("options", "facts"), BAD)
+def test_what_cannot_be_is_refused(options, facts):
+    with raises(ConfigError, *facts):
         RenderRequest(**options)
 
 

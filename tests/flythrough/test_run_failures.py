@@ -15,7 +15,7 @@ from recon_cli.io.images import read_image
 
 def test_up_that_is_not_known_is_said(before_a_wall, tmp_path, caplog):
     assert render(before_a_wall, "--path", "orbit", *SHORT, "--out", tmp_path / "out") == 0
-    assert "up is not known" in caplog.text
+    assert_facts(caplog.text, "up", "known")
 
 
 def test_without_a_trained_model_the_command_to_type_is_named(copied, capsys):
@@ -79,14 +79,14 @@ def test_a_folder_of_other_files_is_left_alone(room, tmp_path, capsys):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "me.jpg").write_text("a photo")
     assert render(room, *SHORT, "--out", tmp_path / "photos") == 7
-    assert "holds me.jpg" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "photos", "me.jpg")
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["me.jpg"]
 
 
 def test_a_folder_that_cannot_be_made_is_an_error(room, tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
     assert render(room, *SHORT, "--out", tmp_path / "file" / "out") == 7
-    assert "cannot be made" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "error:", tmp_path / "file" / "out")
 
 
 @pytest.mark.parametrize(("number", "said"), [

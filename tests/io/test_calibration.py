@@ -58,12 +58,12 @@ def test_a_reflection_and_a_shear_are_refused():
         viewmat_from_pose(sheared, "it")
 
 
-@pytest.mark.parametrize(("value", "said"), [
-    (np.full((4, 4), np.nan), "not finite"), (np.eye(3), "9 numbers"), ("abc", "not a matrix"),
-    ([[1, 2], [3]], "not a matrix"), (None, "numbers"), (np.zeros((4, 4)), "last row"),
-    (np.diag([0.0, 0, 0, 1]), "not a rigid pose")])
-def test_what_is_no_pose_is_refused(value, said):
-    with pytest.raises(FormatError, match=said):
+@pytest.mark.parametrize(("value", "fact"), [
+    (np.full((4, 4), np.nan), "finite"), (np.eye(3), 9), ("abc", "matrix"),
+    ([[1, 2], [3]], "matrix"), (None, "numbers"), (np.zeros((4, 4)), "row"),
+    (np.diag([0.0, 0, 0, 1]), "rigid")])
+def test_what_is_no_pose_is_refused(value, fact):
+    with raises(FormatError, "it", fact):
         viewmat_from_pose(value, "it")
 
 
@@ -78,15 +78,15 @@ def test_a_skewed_matrix_is_refused():
             np.array([[300.0, 9, 299.5], [0, 310, 169.5], [0, 0, 1]]), 600, 340, "K")
 
 
-@pytest.mark.parametrize(("model", "size", "params", "said"), [
-    ("PINHOLE", (4, 4), (1, 1, 2), "takes 4 parameters, but there are 3"),
-    ("LENS", (4, 4), (1, 1, 2, 2, 0), "camera model LENS"),
-    ("PINHOLE", (4, 4), (1, float("nan"), 2, 2), "not finite"),
-    ("PINHOLE", (4, 4), (1, 0, 2, 2), "no camera"),
-    ("PINHOLE", (0, 4), (1, 1, 2, 2), "no camera"),
-    ("PINHOLE", (1e9, 4), (1, 1, 2, 2), "no camera")])
-def test_what_is_no_lens_is_refused(model, size, params, said):
-    with pytest.raises(FormatError, match=said):
+@pytest.mark.parametrize(("model", "size", "params", "facts"), [
+    ("PINHOLE", (4, 4), (1, 1, 2), [4, 3]),
+    ("LENS", (4, 4), (1, 1, 2, 2, 0), ["LENS"]),
+    ("PINHOLE", (4, 4), (1, float("nan"), 2, 2), ["finite"]),
+    ("PINHOLE", (4, 4), (1, 0, 2, 2), ["camera"]),
+    ("PINHOLE", (0, 4), (1, 1, 2, 2), ["camera"]),
+    ("PINHOLE", (1e9, 4), (1, 1, 2, 2), ["camera"])])
+def test_what_is_no_lens_is_refused(model, size, params, facts):
+    with raises(FormatError, "camera 1", *facts):
         make_lens(model, *size, params, "camera 1")
 
 

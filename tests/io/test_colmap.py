@@ -99,7 +99,7 @@ def test_which_view_sees_which_point_is_as_pycolmap_has_it(undistorted):
 def test_visibility_of_a_damaged_model_is_an_error(undistorted, name):
     path = undistorted / "sparse" / name
     path.write_bytes(path.read_bytes()[:-5])
-    with pytest.raises(FormatError, match=name):
+    with raises(FormatError, name):
         read_visibility(undistorted / "sparse")
 
 
@@ -126,7 +126,7 @@ def test_twins_come_from_the_denoised_folder_unless_another_is_named(undistorted
 @pytest.mark.parametrize("name", FILES)
 def test_a_missing_file_is_named(undistorted, name):
     (undistorted / "sparse" / name).unlink()
-    with pytest.raises(FormatError, match=name):
+    with raises(FormatError, name):
         read(undistorted)
 
 

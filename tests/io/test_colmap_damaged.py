@@ -82,7 +82,7 @@ def test_whatever_stands_in_a_byte_is_read_or_refused(tmp_path, name, value):
 def test_a_malformed_line_of_text_is_named(tmp_path, name, old, new, line):
     write_old(tmp_path)
     replaced(tmp_path / "sparse" / f"{name}.txt", old, new)
-    with pytest.raises(FormatError, match=rf"{name}\.txt, line {line}[, :]"):
+    with raises(FormatError, f"{name}.txt", f"line {line}"):
         read_colmap(tmp_path)
 
 
@@ -93,7 +93,7 @@ def test_a_malformed_line_of_rigs_or_frames_is_named(tmp_path, name, old, new):
     write(tmp_path, rig_model(), "txt")
     (tmp_path / "sparse" / "0" / "images.txt").unlink()
     replaced(tmp_path / "sparse" / "0" / f"{name}.txt", old, new)
-    with pytest.raises(FormatError, match=rf"{name}\.txt, line \d+, is malformed"):
+    with raises(FormatError, f"{name}.txt", "line"):
         read_colmap(tmp_path)
 
 

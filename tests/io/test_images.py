@@ -65,22 +65,14 @@ def test_ignored_pixels_are_painted_in_the_mean_of_the_others():
     assert image[0, 2].tolist() == [255, 0, 255]
 
 
-def test_a_mask_that_ignores_nothing_is_none(tmp_path):
-    image = np.random.default_rng(1).integers(0, 256, (6, 9, 3), np.uint8)
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_mask_that_ignores_nothing_is_none_and_one_of_everything_leaves_nothing(tmp_path, kept):
+    image = np.random.default_rng(1).integers(1, 256, (6, 9, 3), np.uint8)
     write_png(tmp_path / "i.png", image)
     read, mask = read_masked_image(
-        tmp_path / "i.png", written(tmp_path / "m.png", np.ones((6, 9), bool)), 9, 6)
-    assert mask is None
-    assert np.array_equal(read, image)
-
-
-def test_a_mask_that_ignores_everything_leaves_nothing(tmp_path):
-    image = np.full((6, 9, 3), 7, np.uint8)
-    write_png(tmp_path / "i.png", image)
-    read, mask = read_masked_image(
-        tmp_path / "i.png", written(tmp_path / "m.png", np.zeros((6, 9), bool)), 9, 6)
-    assert not mask.any()
-    assert not read.any()
+        tmp_path / "i.png", written(tmp_path / "m.png", np.full((6, 9), kept)), 9, 6)
+    assert mask is None if kept else not mask.any()
+    assert np.array_equal(read, image * kept)
 
 
 def test_a_file_that_is_no_mask_is_named(tmp_path):

@@ -1,7 +1,7 @@
 import dataclasses
 
 import pytest
-from facts import assert_facts
+from facts import assert_facts, raises
 
 from recon_cli.errors import BackendError
 from recon_cli.jobs.executor import Command
@@ -60,7 +60,7 @@ def test_whoever_gets_the_ends_may_stop_all(tmp_path):
         raise ValueError(end.code)
 
     executor = Fake()
-    with pytest.raises(ValueError, match="3"):
+    with raises(ValueError, 3):
         run_jobs([make_job(tmp_path, "a", 3)], executor, NullProgress(), report=refuse)
     assert executor.stopped
 
@@ -84,6 +84,5 @@ def test_a_folder_that_cannot_be_read_counts_as_nothing_done(tmp_path):
 
 def test_failures_are_counted_and_named():
     failed = {str(index): "It is dark." for index in range(7)}
-    assert describe_failures({"a": "It is dark."}, 3, "rooms") == (
-        "1 of 3 rooms failed (a: It is dark).")
+    assert_facts(describe_failures({"a": "It is dark."}, 3, "rooms"), 1, 3, "a", "dark")
     assert_facts(describe_failures(failed, 9, "rooms"), 4, 2, "dark")

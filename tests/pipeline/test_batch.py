@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from facts import assert_facts
+from facts import assert_facts, raises
 from posed_sets import make_replica
 
 from recon_cli.cli import main
@@ -70,12 +70,10 @@ def test_captures_of_one_name_have_their_folders_before_it():
     assert names == [Path("/out/a-room"), Path("/out/b-room"), Path("/out/hall")]
 
 
-@pytest.mark.parametrize(("inputs", "said"), [
-    (("/a/room.mp4", "/a/room.mp4"), "more than once"),
-    (("/a/room.mp4", "/a/room.mov"), "would both be"),
-])
-def test_two_captures_in_one_workspace_are_refused(inputs, said):
-    with pytest.raises(ConfigError, match=said):
+@pytest.mark.parametrize("inputs", [
+    ("/a/room.mp4", "/a/room.mp4"), ("/a/room.mp4", "/a/room.mov")])
+def test_two_captures_in_one_workspace_are_refused(inputs):
+    with raises(ConfigError, *inputs):
         name_captures([Path(path) for path in inputs], Path("/out"))
 
 
@@ -153,7 +151,7 @@ def test_a_batch_is_what_single_runs_are_and_goes_on_with_what_is_unfinished(tmp
     assert_facts(capsys.readouterr().err, 1, 3, "captures", "failed")
     rows = {row["capture"]: row for row in read(tmp_path)}
     assert [rows[name]["exit_code"] for name in ("kitchen", "torn", "hall")] == [0, 3, 0]
-    assert "cannot be read as a video" in rows["torn"]["reason"]
+    assert_facts(rows["torn"]["reason"], "torn.mp4", "video")
     assert rows["hall"]["frames"] == rows["hall"]["registered"] == 6
     page = (tmp_path / "out" / "batch.html").read_text(encoding="utf-8")
     assert_facts(page, 2, 3, "captures", "scene")
@@ -179,7 +177,7 @@ def test_a_workspace_of_another_capture_is_left_alone(tmp_path, capsys):
     make_replica(tmp_path / "b" / "room", frames=6, tests=0)
     assert recon("ingest", tmp_path / "a" / "room", "-w", tmp_path / "out" / "room") == 0
     assert recon("batch", tmp_path / "b" / "room", "--out", tmp_path / "out") == 2
-    assert "holds a scene of" in capsys.readouterr().err
+    assert_facts(capsys.readouterr().err, "error:", tmp_path / "out" / "room")
 
 
 def test_two_batches_do_not_share_a_folder(tmp_path, capsys):

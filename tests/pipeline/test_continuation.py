@@ -181,7 +181,8 @@ def test_a_scene_merged_by_the_verb_of_before_is_stale_and_trained_again(
     summary = {**finished.run.summary, "imported_from": "2 blocks", "blocks": 2}
     run = dataclasses.replace(finished.run, summary=summary)
     write_as_before_verbs(job, dataclasses.replace(finished, key=key, run=run))
-    assert stale(job)["train"] == ("it was made by `recon merge`",)
+    (reason,) = stale(job)["train"]
+    assert_facts(reason, "`recon merge`")
     with pytest.raises(StageError) as caught:
         bring(job, "evaluate")
     assert_facts(caught.value.hint, "recon train")

@@ -75,7 +75,7 @@ def test_the_error_of_a_stage_names_photos_by_their_own_files(tmp_path, monkeypa
         raise SfmError("000000.png is blurred.", hint="Take 000000.png anew.")
 
     monkeypatch.setitem(fake_stages.actions, "denoise", fail)
-    with pytest.raises(SfmError, match=r"^28\.jpg is blurred") as caught:
+    with pytest.raises(SfmError) as caught:
         bring(job, "denoise")
     assert (caught.value.message, caught.value.hint) == ("28.jpg is blurred.", "Take 28.jpg anew.")
 

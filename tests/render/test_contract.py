@@ -16,6 +16,7 @@ from backends import (
     compared,
     every_backend,
 )
+from facts import raises
 from oracle import brute_force
 from scenes import camera_at, joined, one_splat, random_splats
 
@@ -173,11 +174,11 @@ def test_wrong_shapes_and_degrees_are_refused(case):
     splats = case.cast(random_splats(3))
     black = torch.zeros(3, dtype=case.dtype, device=case.device)
     other = torch.float64 if case.dtype == torch.float32 else torch.float32
-    with pytest.raises(ValueError, match="background"):
+    with raises(ValueError, "background"):
         render(splats, camera_at(), black.new_zeros(4), 0, backend=case.backend)
-    with pytest.raises(ValueError, match="sh_degree"):
+    with raises(ValueError, "sh_degree"):
         render(splats, camera_at(), black, 4, backend=case.backend)
-    with pytest.raises(ValueError, match="dtype"):
+    with raises(ValueError, "dtype"):
         render(splats, camera_at(), black.to(other), 0, backend=case.backend)
 
 
@@ -185,5 +186,5 @@ def test_float64_is_refused_by_the_backend_that_cannot_take_it(case):
     if case.backend != "numba":
         pytest.skip(f"{case.backend} takes float64")
     assert [other for other in CASES if other.backend == "numba"] == [case]
-    with pytest.raises(ValueError, match="float32 on the CPU"):
+    with raises(ValueError, "float32"):
         render(random_splats(3), camera_at(), BLACK, 0, backend="numba")

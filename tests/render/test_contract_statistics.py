@@ -8,6 +8,7 @@ from functools import cache
 import pytest
 import torch
 from backends import BLACK, GREENISH, MARGIN, every_backend
+from facts import raises
 from oracle import Nudges, composited
 from scenes import camera_at, joined, leaves, one_splat, random_splats
 
@@ -162,7 +163,7 @@ def test_a_mask_of_the_scores_changes_neither_picture_nor_gradient(case):
 def test_a_mask_of_another_size_or_type_is_refused(case):
     splats, camera = scene(seed=6)
     for mask in (torch.ones(33, 20, dtype=torch.bool), torch.ones(20, 33)):
-        with pytest.raises(ValueError, match="mask"):
+        with raises(ValueError, "mask"):
             case.render(splats, camera, scores=True, mask=mask.to(case.device))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from backends import BLACK, GREENISH, Case
+from facts import raises
 from interpreter import DEVICE
 from scenes import camera_at, random_splats
 
@@ -47,7 +48,7 @@ def test_the_same_small_scene_gives_the_same_bits_in_any_order_of_its_gaussians(
 
 
 def test_float64_is_refused():
-    with pytest.raises(ValueError, match="takes float32"):
+    with raises(ValueError, "float32"):
         render(random_splats(3), camera_at(), BLACK, 0, backend="triton")
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import WatchedPage
+from facts import assert_facts
 from report_workspace import change, give_title, paint, report
 
 from recon_cli.io.images import write_png
@@ -115,7 +116,7 @@ def test_the_difference_takes_the_place_of_the_render_and_has_a_legend(workspace
     page.page.click("#difference")
     assert fraction_dark(page) == pytest.approx(0.5, abs=0.03)
     assert page.page.locator("#ramp").is_visible()
-    assert "amplified 4 times" in page.page.locator("#ramp").inner_text()
+    assert_facts(page.page.locator("#ramp").inner_text(), 4)
     assert page.page.get_attribute("#difference", "aria-pressed") == "true"
     page.page.keyboard.press("d")
     assert fraction_dark(page) < 0.03

@@ -6,6 +6,7 @@ import json
 from types import SimpleNamespace
 
 import pytest
+from facts import assert_facts
 
 from recon_cli.report.room import read_room
 
@@ -32,7 +33,9 @@ def test_measures_are_shown_with_their_intervals(export):
 def test_measures_that_were_kept_of_an_earlier_export_are_called_stale(export):
     export.parts = [SimpleNamespace(
         name="export.plan.svg", fresh=False, why="sfm's output changed")]
-    assert read_room(export).notes == ("The plan is stale: sfm's output changed.", "No floor.")
+    stale, note = read_room(export).notes
+    assert_facts(stale, "stale", "sfm's output changed")
+    assert note == "No floor."
 
 
 def test_without_a_plan_there_is_no_room(export):
@@ -45,4 +48,4 @@ def test_damaged_measures_are_said_to_be_damaged(export, text):
     (export.folder / "measures.json").write_text(text)
     room = read_room(export)
     assert room.figures == ()
-    assert "not shown" in room.notes[0]
+    assert_facts(room.notes[0], "not shown")

@@ -53,7 +53,7 @@ def test_two_that_contradict_by_a_unit_leave_no_scale():
     assert fused.scale is None
     sentence, = fused.describe()
     assert_facts(sentence, "tracked", "poses")
-    assert "sensor depth" in sentence
+    assert_facts(sentence, "sensor")
     assert_facts(sentence, "--scale-between", "METRES")
 
 

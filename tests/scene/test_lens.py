@@ -19,9 +19,9 @@ def test_a_single_focal_length_takes_the_mean_of_both_scales():
 
 
 def test_an_unknown_model_and_a_wrong_number_of_parameters_are_refused():
-    with pytest.raises(ValueError, match="unknown"):
+    with raises(ValueError, "FISH"):
         Lens("FISH", 4, 4, ())
-    with pytest.raises(ValueError, match="takes 4 parameters, not 3"):
+    with raises(ValueError, 4, 3):
         Lens("PINHOLE", 4, 4, (1.0, 2.0, 2.0))
 
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from facts import raises
 
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
@@ -80,7 +81,7 @@ def test_json_keeps_every_bit():
     {"translation": np.array([0.0, np.inf, 0.0])}, {"translation": np.zeros(4)},
 ])
 def test_what_is_no_similarity_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"similarity|rotation"):
+    with raises(ValueError, *wrong):
         Similarity(**wrong)
 
 
@@ -97,7 +98,7 @@ def test_a_matrix_gives_back_the_similarity_that_it_was_made_of():
 @pytest.mark.parametrize(("matrix", "reason"), [
     (np.diag([1.0, 1, -1, 1]), "mirrors"), (np.diag([1.0, 1, 1.001, 1]), "stretches"),
     (np.diag([0.0, 0, 0, 1]), "stretches"), (np.diag([1e200, 1e200, 1e200, 1]), "stretches"),
-    (np.diag([np.nan, 1, 1, 1]), "finite"), (np.eye(4) * 2, "last row")])
+    (np.diag([np.nan, 1, 1, 1]), "finite"), (np.eye(4) * 2, "row")])
 def test_a_matrix_that_is_no_similarity_is_refused_with_the_reason(matrix, reason):
-    with pytest.raises(ValueError, match=reason):
+    with raises(ValueError, reason):
         Similarity.from_matrix(matrix)

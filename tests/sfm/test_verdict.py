@@ -154,7 +154,7 @@ def test_a_leap_out_of_the_world_is_a_problem(tmp_path):
     made = walk(motions={5: moved(0, 3000, 0)})
     verdict = verdict_on(made, tmp_path)
     assert not verdict.trusted
-    assert any(f"jumps from {made.names[4]}" in problem for problem in verdict.problems)
+    assert_facts("\n".join(verdict.problems), "jumps", made.names[4])
     with raises(SfmError, "jumps"):
         check_weak_link(verdict, accept=False)
     check_weak_link(verdict, accept=False, given=True)
@@ -178,10 +178,10 @@ def test_images_without_a_camera_have_a_reason(tmp_path):
     sharpness = dict.fromkeys(made.names, 100.0) | {made.names[3]: 20.0}
     reasons = verdict_on(made, tmp_path, sharpness=sharpness).unregistered
     assert list(reasons) == [made.names[index] for index in (3, 5, 10, 11)]
-    assert reasons[made.names[3]] == "blurred: sharpness 20, 100 is usual"
+    assert_facts(reasons[made.names[3]], "blurred", 20, 100)
     assert_facts(reasons[made.names[5]], "matched", "placed")
     assert_facts(reasons[made.names[5]], 8, "images")
-    assert "no overlap" in reasons[made.names[10]]
+    assert_facts(reasons[made.names[10]], "overlap")
 
 
 def test_two_cameras_are_too_few_to_tell(tmp_path):
@@ -213,20 +213,19 @@ def test_the_same_model_gets_the_same_verdict_twice(tmp_path):
 
 @pytest.mark.integration
 def test_the_text_says_first_whether_the_model_can_be_trusted(tmp_path):
-    assert verdict_on(walk(), tmp_path).lines()[0] == (
-        "16 of 16 images have a camera; the model is trusted.")
+    assert_facts(verdict_on(walk(), tmp_path).lines()[0], "16 of 16", "trusted")
     (tmp_path / "database.db").unlink()
     lines = verdict_on(broken_walk(), tmp_path).lines()
-    assert "not to be trusted" in lines[0]
+    assert_facts(lines[0], "not", "trusted")
     assert_facts(lines[1], "model", "broken")
 
 
 def test_an_image_that_the_database_lacks_is_a_mistake_of_the_program(tmp_path):
     made = walk()
     database = made.write_database(tmp_path / "database.db")
-    with pytest.raises(ValueError, match="holds 16 of 17"):
+    with raises(ValueError, 16, 17):
         examine(made.model(), database, [*made.names, "other.png"])
-    with pytest.raises(ValueError, match="000015"):
+    with raises(ValueError, made.names[-1]):
         examine(made.model(), database, made.names[:-1])
 
 
@@ -248,33 +247,36 @@ def capture(keypoints, pairs=(), matches=()):
         matches=np.array(matches, np.int64))
 
 
+def explained(evidence, **sharpness):
+    """Returns the reason of image c, the only one without a camera."""
+    ((name, reason),) = explain_unregistered(evidence, sharpness).items()
+    assert name == "c"
+    return reason
+
+
 def test_the_sharpness_of_the_others_decides_what_is_blurred():
     evidence = capture([900, 900, 900])
-    assert explain_unregistered(evidence, {"a": 50.0, "b": 60.0, "c": 20.0}) == {
-        "c": "blurred: sharpness 20, 50 is usual"}
-    assert "no overlap" in explain_unregistered(evidence, {"a": 50.0, "b": 60.0, "c": 40.0})["c"]
+    assert_facts(explained(evidence, a=50.0, b=60.0, c=20.0), "blurred", 20, 50)
+    assert_facts(explained(evidence, a=50.0, b=60.0, c=40.0), "overlap")
 
 
 def test_an_image_that_matches_another_room_is_not_called_blurred_alone():
     evidence = capture([900] * 4, [[0, 1], [2, 3]], [300, 300])
-    assert explain_unregistered(evidence, {"a": 50.0, "b": 60.0, "c": 20.0, "d": 61.0})["c"] == (
-        "no overlap: no verified match with an image that has a camera, only with 1 without "
-        "one; sharpness 20, 55 is usual")
+    reasons = explain_unregistered(evidence, {"a": 50.0, "b": 60.0, "c": 20.0, "d": 61.0})
+    assert_facts(reasons["c"], "overlap", "1 without", 20, 55)
 
 
 def test_an_image_of_a_bare_wall_has_too_few_features():
-    assert explain_unregistered(capture([900, 900, 40]), {}) == {
-        "c": "too few features: 40 keypoints"}
+    assert_facts(explained(capture([900, 900, 40])), "features", 40)
 
 
 def test_an_image_that_matches_nothing_has_no_overlap():
-    assert explain_unregistered(capture([900] * 3, [[0, 1]], [300]), {"c": None}) == {
-        "c": "no overlap: no verified match with an image that has a camera"}
+    assert_facts(explained(capture([900] * 3, [[0, 1]], [300]), c=None), "overlap")
 
 
 def test_an_image_that_matches_is_said_to_match():
-    reasons = explain_unregistered(capture([900] * 3, [[0, 1], [0, 2], [1, 2]], [300, 20, 30]), {})
-    assert reasons == {"c": "matched but not placed: 50 matches to 2 images with a camera"}
+    matched = capture([900] * 3, [[0, 1], [0, 2], [1, 2]], [300, 20, 30])
+    assert_facts(explained(matched), "placed", 50, 2)
 
 
 def path(centers, names=None):

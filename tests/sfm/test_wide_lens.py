@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 import pycolmap
 import pytest
-from facts import raises
+from facts import assert_facts, raises
 from synthetic import make_capture
 
 from recon_cli.errors import SfmError
@@ -67,7 +67,7 @@ def samples(lens):
 
 @pytest.mark.integration
 def test_a_fisheye_is_found_with_about_its_focal_length():
-    focal = wide_lens._find_focal(GROUP, samples(FISHEYE), seed=0, threads=2)
+    focal = wide_lens._find_focal(GROUP, samples(FISHEYE), seed=0)
     assert focal == pytest.approx(360, rel=0.12)  # steps are a fifth
 
 
@@ -75,14 +75,36 @@ def test_a_fisheye_is_found_with_about_its_focal_length():
 @pytest.mark.parametrize("lens", [
     WIDE, ("SIMPLE_PINHOLE", (900.0, 512.0, 384.0)), ("SIMPLE_PINHOLE", (480.0, 512.0, 384.0))])
 def test_an_ordinary_lens_is_none(lens):
-    assert wide_lens._find_focal(GROUP, samples(lens), seed=0, threads=2) is None
+    assert wide_lens._find_focal(GROUP, samples(lens), seed=0) is None
+
+
+@pytest.mark.parametrize(("last", "found"), [(200, True), (175, False)])
+def test_a_lens_is_tried_on_as_many_pairs_as_may_change_the_answer(monkeypatch, last, found):
+    """An ordinary lens explains 120 of 200 matches, a fisheye 110, and more in the last pair."""
+    pairs = [(np.full((200, 2), pair), np.zeros((200, 2))) for pair in range(5)]
+    tried = []
+
+    def explain(camera, sample, **_):
+        tried.append(camera.model_name)
+        if camera.model_name == wide_lens.ORDINARY:
+            return 120
+        return last if sample[0][0, 0] == 4 else 110
+
+    monkeypatch.setattr(wide_lens, "count_explained", explain)
+    focal = wide_lens._find_focal(GROUP, pairs, seed=0)  # 600 of 1,000 against 640 or 615
+    assert focal == (wide_lens.FOCALS[0] * WIDTH if found else None)
+    monkeypatch.setattr(wide_lens, "count_explained", lambda camera, *_, **__: (
+        tried.append(camera.model_name) or 195))
+    tried.clear()
+    assert wide_lens._find_focal(GROUP, pairs, seed=0) is None
+    assert set(tried) == {wide_lens.ORDINARY}  # a fisheye has too little left to gain
 
 
 def test_few_matches_decide_nothing_unless_the_lens_is_named():
     few = [(ours[:10], theirs[:10]) for ours, theirs in samples(FISHEYE)]
-    assert wide_lens._find_focal(GROUP, few, seed=0, threads=2) is None
+    assert wide_lens._find_focal(GROUP, few, seed=0) is None
     named = dataclasses.replace(GROUP, model="RADIAL_FISHEYE")
-    assert wide_lens._find_focal(named, few, seed=0, threads=2) is not None
+    assert wide_lens._find_focal(named, few, seed=0) is not None
     assert wide_lens._camera(named, wide_lens.FISHEYE, 300.0).model_name == "RADIAL_FISHEYE"
 
 
@@ -113,8 +135,8 @@ def test_a_fisheye_is_mapped_as_one_and_its_distortion_is_found(tmp_path):
     job, centers = capture_of(tmp_path, FISHEYE)
     result = fallbacks.build_model(job, Reporter(io.BytesIO()))
     (attempt,) = result.attempts
-    assert (attempt.name, attempt.reason) == (
-        "fisheye", "the matches are those of a fisheye lens")
+    assert attempt.name == "fisheye"
+    assert_facts(attempt.reason, "fisheye")
     model = pycolmap.Reconstruction(job.model)
     assert model.camera(1).model_name == "OPENCV_FISHEYE"
     np.testing.assert_allclose(model.camera(1).params[:4], FISHEYE[1][:4], atol=3)

@@ -22,7 +22,7 @@ def columns(axes):
 def test_a_point_stays_where_it_is_in_the_room(axes):
     ours = PLY if up_of(axes) == "-y" else Z_UP
     splats = few()
-    turned = turn_from(axes, splats)
+    turned = turn_from(axes, splats.as_arrays()).as_tensors()
     before = splats.means.double().numpy() @ columns(axes).T
     after = turned.means.double().numpy() @ columns(ours).T
     assert np.array_equal(before, after)
@@ -31,7 +31,7 @@ def test_a_point_stays_where_it_is_in_the_room(axes):
 @pytest.mark.parametrize("axes", ["rub", "ruf", "lbu"])
 def test_shapes_and_colours_turn_with_it(axes):
     splats = few()
-    turned = turn_from(axes, splats)
+    turned = turn_from(axes, splats.as_arrays()).as_tensors()
     matrix = np.diag(signs(axes)).astype(float)
     for one, other in zip(_covariances(splats), _covariances(turned), strict=True):
         assert np.allclose(matrix @ one @ matrix.T, other, atol=1e-9 + 1e-6 * np.abs(one).max())
@@ -54,6 +54,6 @@ def _covariances(splats):
 
 def test_turning_twice_changes_nothing_to_the_bit():
     splats = few()
-    back = flip(flip(splats, [1, -1, -1]), [1, -1, -1])
+    back = flip(flip(splats.as_arrays(), [1, -1, -1]), [1, -1, -1]).as_tensors()
     for name, value in splats.parameters().items():
         assert torch.equal(getattr(back, name), value), name

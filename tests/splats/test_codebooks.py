@@ -110,3 +110,10 @@ def test_zeros_among_others_are_one_entry(rng):
     entries, labels = fit_palette(rows, 1000, rng)
     np.testing.assert_allclose(entries[labels], rows, atol=1e-6)
     assert len(entries) == 201
+
+
+def test_rows_that_differ_by_the_sign_of_a_zero_are_one(rng):
+    rows = np.tile(np.array([[0.0, 2.0], [-0.0, 2.0]], np.float32), (50, 1))
+    entries, labels = fit_palette(rows, 10, rng)
+    assert len(entries) == 1
+    assert not labels.any()

@@ -1,21 +1,18 @@
 """The compressed .ply: each parameter within its step, chunks compact, bad files refused."""
 
 import re
-import tracemalloc
 
 import numpy as np
 import pytest
 import torch
-from examples import examples
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from facts import raises
 from scenes import random_splats
-from splat_cases import N, damaged, edge_splats, greatest, read_or_refused, rotation_error
+from splat_cases import N, edge_splats, greatest, rotation_error
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.harmonics import basis_rest
 from recon_cli.scene.splats import SH_C0, joined, with_rows
-from recon_cli.splats.compressed_ply import FORMAT, load_compressed_ply, write_compressed_ply
+from recon_cli.splats.compressed_ply import load_compressed_ply, write_compressed_ply
 from recon_cli.splats.values import compact_order, morton_order
 
 
@@ -145,58 +142,12 @@ def test_what_does_not_fit_is_refused_and_tiny_scales_are_clamped(tmp_path):
     write_compressed_ply(path, splats)
     assert load_compressed_ply(path).splats.log_scales.min() == -20
     splats.log_scales[4] = 21
-    for bad, message in [
-            (splats, "1 Gaussians are too large"), (splats.select(torch.arange(0)), "no Gaussians"),
-            (few().map(lambda value: value * np.nan), "not finite in means")]:
-        with pytest.raises(FormatError, match=message):
+    for bad, *facts in [
+            (splats, 1, "large"), (splats.select(torch.arange(0)), "Gaussians"),
+            (few().map(lambda value: value * np.nan), "finite", "means")]:
+        with raises(FormatError, *facts):
             write_compressed_ply(tmp_path / "b.ply", bad)
     assert not (tmp_path / "b.ply").exists()
-
-
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda _: b"", "not a .ply"),
-    (lambda data: data[:-1], "truncated"),
-    (lambda data: data + bytes(9), "truncated or damaged"),
-    (lambda data: data.replace(b"vertex 9", b"vertex 9000000000"), "truncated"),
-    (lambda data: data.replace(b"chunk 1", b"chunk 2").replace(b"end_header\n", (
-        b"end_header\n" + bytes(72))), "2 chunks of 256 for 9"),
-    (lambda data: data.replace(b"packed_scale", b"scale"), "not a compressed"),
-    (lambda data: data.replace(b"min_y", b"min_w"), "not a compressed"),
-    (lambda data: data.replace(b"min_g", b"min_q"), "not a compressed"),
-    (lambda data: data.replace(b"uint packed_scale", b"float packed_scale"), "not a compressed"),
-    (lambda data: data.replace(b"sh 9", b"sh 8")[:-9], "do not fill a degree"),
-    (lambda data: data.replace(b"uchar f_rest_8", b"char f_rest_8"), "do not fill a degree"),
-    (lambda data: data.replace(b"f_rest_8", b"f_rest_9"), "do not fill a degree"),
-    (lambda data: data.replace(b"binary_little_endian", b"ascii"), "truncated or damaged"),
-    (lambda data: data.replace(b"end_header\n", b"end_header\n" + b"\xff" * 4, 1)[:-4],
-     "not finite in means"),
-    # a signalling NaN, of which a cast complains
-    (lambda data: data.replace(b"end_header\n", b"end_header\n" + b"\1\0\xa0\x7f", 1)[:-4],
-     "not finite in means"),
-    (lambda data: data.replace(b"end_header\n", b"end_header\n" + (
-        np.full(18, 3e38, "<f4").tobytes()), 1)[:-72], "not finite in sh_dc"),
-])
-@pytest.mark.filterwarnings("error")
-def test_damaged_files_are_refused_with_the_reason(tmp_path, change, message):
-    path = tmp_path / "a.ply"
-    write_compressed_ply(path, few())
-    path.write_bytes(change(path.read_bytes()))
-    tracemalloc.start()
-    try:
-        with pytest.raises(FormatError, match=message):
-            load_compressed_ply(path)
-        assert tracemalloc.get_traced_memory()[1] < 1 << 20
-    finally:
-        tracemalloc.stop()
-
-
-@pytest.mark.integration
-@settings(max_examples=examples(200))
-@given(seed=st.integers(0, 2**63), degree=st.integers(0, 3))
-def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed, degree):
-    path = tmp_path_factory.getbasetemp() / "fuzz.compressed.ply"
-    write_compressed_ply(path, few(4, degree))
-    read_or_refused(FORMAT.read, path, damaged(path.read_bytes(), seed))
 
 
 def test_what_lies_far_outside_takes_no_bits_from_the_rest(tmp_path):

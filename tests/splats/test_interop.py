@@ -8,7 +8,7 @@ from splat_cases import greatest, rotation_error
 from recon_cli.scene.splats import SH_C0
 from recon_cli.splats.compressed_ply import load_compressed_ply
 from recon_cli.splats.ply import read_ply
-from recon_cli.splats.splat import read_splat
+from recon_cli.splats.splat import FORMAT
 from recon_cli.splats.spz import load_spz
 
 
@@ -41,7 +41,7 @@ def test_one_scene_as_ply_and_spz_agrees_within_the_steps_of_spz(points):
 
 
 def test_one_scene_as_ply_and_splat_agrees_within_the_steps_of_splat(points):
-    ply, splat = read_ply(points("ply")), read_splat(points("splat"))
+    ply, splat = read_ply(points("ply")), FORMAT.read(points("splat"))
     assert torch.equal(splat.means, ply.means)
     assert greatest(splat.log_scales, ply.log_scales) <= 1e-5
     # This writer cuts off where others round: up to a whole step.
@@ -58,7 +58,7 @@ def test_a_file_without_gzip_is_the_one_with_it(minimal):
 
 
 def test_four_points_on_a_square_are_one_scene_in_every_version(minimal):
-    splat = read_splat(minimal / "minimal.splat")
+    splat = FORMAT.read(minimal / "minimal.splat")
     assert splat.means.tolist() == [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]]
     for version in (3, 4):
         spz = load_spz(minimal / f"minimal-v{version}.spz", axes="rub").splats
@@ -91,7 +91,7 @@ def test_a_scene_of_150_thousand_agrees_as_spz_and_compressed_ply(biker):
 def test_larger_files_of_other_programs_are_read(shared_data, biker):
     guitar = load_compressed_ply(biker / "guitar.compressed.ply").splats
     assert (len(guitar), guitar.sh_degree) == (90854, 0)
-    model = read_splat(shared_data / "interop" / "splat-viewer" / "model.splat")
+    model = FORMAT.read(shared_data / "interop" / "splat-viewer" / "model.splat")
     assert len(model) == 124495
     for splats in (guitar, model):
         assert (splats.quats.norm(dim=1) - 1).abs().max() < 0.02

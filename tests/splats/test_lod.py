@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 
 import archive_splats
@@ -49,7 +50,7 @@ def test_each_level_has_a_quarter_of_the_one_before(tmp_path):
 def test_the_leaves_hold_every_gaussian_of_every_level_once(tmp_path):
     levels = written(tmp_path)
     meta = meta_of(tmp_path)
-    files = [read_files(Unpacked(tmp_path / name)) for name in meta["filenames"]]
+    files = [read_files(Unpacked(tmp_path / name)).as_tensors() for name in meta["filenames"]]
     assert len(files) > len(levels)
     for level, splats in enumerate(levels):
         seen = {file: torch.zeros(len(part), dtype=torch.int64) for file, part in enumerate(files)}
@@ -197,8 +198,10 @@ def test_many_files_may_not_claim_more_than_all_of_them_can_hold(tmp_path, monke
         path = tmp_path / name
         path.write_text(json.dumps(json.loads(path.read_text()) | {"count": 700_000}))
     monkeypatch.setattr(lod, "read_files", None)  # nothing is decoded
-    with pytest.raises(FormatError, match=r"(1400|2100|2800|3500)000 Gaussians in"):
+    with pytest.raises(FormatError) as caught:
         load_lod(tmp_path / "lod-meta.json")
+    (count,) = re.findall(r"(\d+) Gaussians", caught.value.message)
+    assert int(count) in (1_400_000, 2_100_000, 2_800_000, 3_500_000)
 
 
 def test_a_pipe_among_the_files_is_not_waited_for(tmp_path):

@@ -1,17 +1,13 @@
 """The .ply of INRIA: what we write is what it should be, and bad files are refused."""
 
-import re
 import tracemalloc
 
 import numpy as np
 import pytest
 import torch
-from examples import examples
 from facts import assert_facts, raises
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scenes import random_splats, with_harmonics
-from splat_cases import damaged, read_or_refused
+from splat_cases import rewritten
 
 from recon_cli.errors import FormatError
 from recon_cli.splats.ply import read_ply, write_ply
@@ -122,62 +118,6 @@ def test_another_order_a_lower_degree_and_unknown_properties_are_read(tmp_path):
     assert back.sh_rest[0].tolist() == [[9, 12, 15], [10, 13, 16], [11, 14, 17]]
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda data: data[:-7], "truncated"),
-    (lambda data: data + bytes(20), "truncated or damaged"),
-    (lambda data: data.replace(b"property float nx\n", b""), "truncated or damaged"),
-    (lambda data: data[:0], "not a .ply"),
-    (lambda data: b"PK\x03\x04" + data, "not a .ply"),
-    (lambda data: data.replace(b"vertex 20", b"vertex 2000000000"), "truncated"),
-    (lambda data: data.replace(b"vertex 20", b"vertex -5"), "element vertex -5"),
-    (lambda data: data.replace(b"vertex 20", b"vertex " + b"9" * 5000), "element vertex 999"),
-    (lambda data: data.replace(b"vertex 20", b"face 20"), "holds face, but no vertices"),
-    (lambda data: data.replace(b"vertex 20", b"vertex 20\nelement vertex 0"), "without prop"),
-    (lambda data: data.replace(b"end_header", b"element a 0\nproperty int x\nelement a 0\n"
-                               b"property int x\nend_header"), "element twice"),
-    (lambda data: data.replace(b"end_header", b"element a 1\nproperty int x\nend_header"),
-     "1 of a of 4 bytes"),
-    (lambda data: data.replace(b"binary_little_endian", b"binary_middle_endian"), "neither"),
-    (lambda data: data.replace(b"format", b"from"), "neither"),
-    (lambda _: b"ply\nformat ascii 1.0\nproperty int x\nend_header\n", "without elements"),
-    (lambda data: data.replace(b"float x\n", b"floot x\n"), "floot x"),
-    (lambda data: data.replace(b"float x\n", b"uint packed_position\n"), "compressed .ply"),
-    (lambda data: data.replace(b"float opacity", b"float opacite"), "lacks the properties"),
-    (lambda data: data.replace(b"float x\n", b"list uchar int x\n"), "lists, not Gaussians"),
-    (lambda data: re.sub(rb"property float (opacity|scale_\d|rot_\d)\n", rb"property float a\1\n",
-                         data), "point cloud"),
-    *((lambda data, name=name: data.replace(b"float ny", b"float " + name), "moving Gaussians")
-      for name in (b"trbf_center", b"motion_0", b"t", b"scale_t", b"rot_r_0")),
-    (lambda data: data.replace(b"f_rest_44", b"g_rest_44"), "f_rest"),
-    (lambda data: re.sub(rb"f_rest_(\d\n|1\d|20)", rb"g_rest_\1", data), "numbered from 0"),
-    (lambda data: data.replace(b"float ny", b"float nx"), "twice"),
-    (lambda data: data[:-4] + np.float32(np.nan).tobytes(), r"not finite in rot_3 \(1\)"),
-])
-def test_damaged_files_are_refused_with_the_reason(tmp_path, splats, change, message):
-    path = tmp_path / "a.ply"
-    write_ply(path, splats)
-    path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(FormatError, match=message):
-        read_ply(path)
-
-
-def rewritten(path, form, kind="float", extra=(), tail=b""):
-    """Writes a .ply of `write_ply` again in another form, with columns before and a tail."""
-    head, data = path.read_bytes().split(b"end_header\n", 1)
-    names = [line.split()[2] for line in head.decode().splitlines() if "property" in line]
-    count = int(re.search(rb"vertex (\d+)", head)[1])
-    table = np.frombuffer(data, "<f4").reshape(count, len(names))
-    table = np.hstack([np.full((count, len(extra)), 7, "f4"), table])
-    lines = ["ply", f"format {form} 1.0", "comment by hand", f"element vertex {count}",
-             *(f"property {kind} {name}" for name in [*extra, *names])]
-    if form == "ascii":
-        body = "".join(" ".join(repr(float(x)) for x in row) + "\n" for row in table).encode()
-    else:
-        order = "<" if "little" in form else ">"
-        body = table.astype(order + {"float": "f4", "double": "f8"}[kind]).tobytes()
-    path.write_bytes("\n".join(lines).encode() + tail.replace(b"BODY", body))
-
-
 FORMS = ["ascii", "binary_big_endian", "binary_little_endian"]
 
 
@@ -240,24 +180,6 @@ def test_a_header_of_hundreds_of_kilobytes_is_read(tmp_path, splats):
         read_ply(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda text: text[:-300], "are not 62 numbers"),
-    (lambda text: text[:text[:-2].rindex("\n") + 1], "promises 20 rows but holds 19"),
-    (lambda text: text + "1 2 3\n", "promises 20 rows but holds 21"),
-    (lambda text: text.replace("vertex 20", "vertex 2000000000"), "truncated"),
-    (lambda text: re.sub(r"(end_header\n)[^ ]+", r"\1word", text), "are not 62 numbers"),
-    (lambda text: re.sub(r"(end_header\n)[^ ]+", r"\1nan", text), r"x \(1\)"),
-    (lambda text: re.sub(r"(end_header\n)[^ ]+", r"\g<1>1e60", text), r"x \(1\)"),
-])
-def test_damaged_ascii_is_refused_with_the_reason(tmp_path, splats, change, message):
-    path = tmp_path / "a.ply"
-    write_ply(path, splats)
-    rewritten(path, "ascii", tail=b"\nend_header\nBODY")
-    path.write_text(change(path.read_text()))
-    with pytest.raises(FormatError, match=message):
-        read_ply(path)
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_a_count_that_the_file_cannot_hold_takes_no_memory(tmp_path, splats, form):
     path = tmp_path / "a.ply"
@@ -273,20 +195,6 @@ def test_a_count_that_the_file_cannot_hold_takes_no_memory(tmp_path, splats, for
         tracemalloc.stop()
 
 
-@settings(max_examples=examples(200))
-@given(seed=st.integers(0, 2**63), form=st.sampled_from(FORMS), degree=st.integers(0, 3))
-def test_a_damaged_file_gives_gaussians_or_a_format_error(tmp_path_factory, seed, form, degree):
-    path = tmp_path_factory.getbasetemp() / "fuzz.ply"
-    write_ply(path, with_harmonics(random_splats(5, dtype=torch.float32), degree, 4))
-    rewritten(path, form, tail=b"\nend_header\nBODY")
-    read_or_refused(read_ply, path, damaged(path.read_bytes(), seed))
-
-
-def test_a_missing_file_is_refused(tmp_path):
-    with raises(FormatError):
-        read_ply(tmp_path / "none.ply")
-
-
 def test_a_failed_write_leaves_the_old_file(tmp_path, splats, monkeypatch):
     path = tmp_path / "a.ply"
     write_ply(path, splats)
@@ -296,7 +204,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, splats, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with raises(OSError, 28):
         write_ply(path, splats.select(torch.arange(3)))
     assert path.read_bytes() == before
     assert [item.name for item in tmp_path.iterdir()] == ["a.ply"]

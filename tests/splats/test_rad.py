@@ -1,14 +1,10 @@
-"""Files laid out as Spark writes .rad are read in every encoding; damaged ones are refused.
+"""Files laid out as Spark writes .rad are read in every encoding.
 
 What is written is read back, by Spark too.
 """
 
 from __future__ import annotations
 
-import json
-import struct
-import zlib
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,9 +13,10 @@ import numpy as np
 import pytest
 import torch
 from facts import raises
+from rad_writer import DEFAULT, FLOATS, HALVES, OTHERS, N, chunk, rad, values
 from scipy.spatial import cKDTree
 from spark import assert_spark_agrees, decode
-from splat_cases import damaged, rotation_error
+from splat_cases import rotation_error
 
 from recon_cli.errors import FormatError
 from recon_cli.scene.splats import SH_C0, Splats
@@ -29,101 +26,6 @@ from recon_cli.splats.registry import load_splats, read_splats
 
 if TYPE_CHECKING:
     from browser import WatchedPage
-
-N = 6
-FLOATS = {"center": "f32", "alpha": "f32", "rgb": "f32", "scales": "f32", "orientation": "f32",
-          "sh": "f32"}
-HALVES = {"center": "f16", "alpha": "f16", "rgb": "f16", "scales": "ln_f16", "orientation": "f16",
-          "sh": "f16"}
-DEFAULT = {"center": "f32_lebytes", "alpha": "r8", "rgb": "r8_delta", "scales": "ln_0r8",
-           "orientation": "oct88r8", "sh": "s8"}
-OTHERS = DEFAULT | {"center": "f16_lebytes", "rgb": "r8", "sh": "s8_delta"}
-LIMITS = {"alpha": (0.0, 1.0), "rgb": (-0.5, 1.5), "scales": (-12.0, 9.0), "sh1": (-1.0, 1.0),
-          "sh2": (-2.0, 2.0), "sh3": (-3.0, 3.0)}
-
-
-def values() -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(2)
-    quats = rng.normal(size=(N, 4))
-    quats[:, 3] = abs(quats[:, 3])  # xyzw, as Spark has them
-    table = {
-        "center": rng.uniform(-5, 5, (N, 3)), "alpha": rng.uniform(0.1, 0.9, (N, 1)),
-        "rgb": rng.uniform(-0.4, 1.4, (N, 3)), "scales": np.exp(rng.uniform(-6, 1, (N, 3))),
-        "orientation": quats / np.linalg.norm(quats, axis=1, keepdims=True)}
-    for degree, count in ((1, 9), (2, 15), (3, 21)):
-        table[f"sh{degree}"] = rng.uniform(-0.9, 0.9, (N, count))
-    return table
-
-
-def octahedral(quats: np.ndarray) -> bytes:
-    half = np.arccos(quats[:, 3])
-    axis = quats[:, :3] / np.sin(half)[:, None]
-    axis /= abs(axis).sum(axis=1, keepdims=True)
-    x, y, below = axis[:, 0], axis[:, 1], axis[:, 2] < 0
-    x, y = (np.where(below, (1 - abs(b)) * np.where(a >= 0, 1, -1), a) for a, b in ((x, y), (y, x)))
-    turned = np.stack([(x + 1) / 2, (y + 1) / 2, 2 * half / np.pi], axis=1)
-    return np.rint(turned * 255).astype("u1").tobytes()
-
-
-def encode(data: np.ndarray, encoding: str, low: float, high: float) -> bytes:
-    """One property: all first components, then all second ones."""
-    plane = data.T
-    share = np.rint(np.clip((plane - low) / (high - low) * 255, 0, 255)).astype("u1")
-    signed = np.rint(plane / high * 127).astype("i1").view("u1")
-    if encoding.endswith("_lebytes"):
-        kind = "<f4" if encoding.startswith("f32") else "<f2"
-        flat = plane.astype(kind).ravel()
-        return np.ascontiguousarray(flat.view("u1").reshape(len(flat), -1).T).tobytes()
-    if encoding.endswith("_delta"):
-        return np.diff(share if encoding[0] == "r" else signed, axis=1, prepend=0).astype(
-            "u1").tobytes()
-    return {
-        "f32": lambda: plane.astype("<f4"), "f16": lambda: plane.astype("<f2"),
-        "ln_f16": lambda: np.log(plane).astype("<f2"), "r8": lambda: share, "s8": lambda: signed,
-        "ln_0r8": lambda: np.rint((np.log(plane) - low) / (high - low) * 254 + 1).astype("u1"),
-        "u16": lambda: plane.astype("<u2"), "u32": lambda: plane.astype("<u4"),
-    }[encoding]().tobytes()
-
-
-def padded(data: bytes) -> bytes:
-    return data + bytes(-len(data) % 8)
-
-
-def head(magic: bytes, meta: dict[str, object]) -> bytes:
-    text = json.dumps(meta).encode()
-    return magic + struct.pack("<I", len(text)) + padded(text)
-
-
-def chunk(table: dict[str, np.ndarray], encodings: dict[str, str], base: int = 0) -> bytes:
-    properties, payload = [], b""
-    for name, data in table.items():
-        encoding = encodings.get(name) or encodings["sh"]
-        low, high = LIMITS.get(name, (0.0, 1.0))
-        if name == "orientation":
-            plain = octahedral(data) if encoding == "oct88r8" else encode(
-                data[:, :3], encoding, low, high)
-        else:
-            plain = encode(data, encoding, low, high)
-        packer = zlib.compressobj(wbits=-15)
-        packed = packer.compress(plain) + packer.flush()
-        limits = {} if encoding[0] in "fu" or encoding == "ln_f16" else {"min": low, "max": high}
-        properties.append({
-            "offset": len(payload), "bytes": len(packed), "property": name, "encoding": encoding,
-            "compression": "gz", **limits})
-        payload += padded(packed)
-    return head(b"RADC", {
-        "version": 1, "base": base, "count": len(table["center"]), "payloadBytes": len(payload),
-        "properties": properties}) + struct.pack("<Q", len(payload)) + payload
-
-
-def rad(parts: list[bytes], number: int, **more: object) -> bytes:
-    offsets = np.cumsum([0, *map(len, parts)]).tolist()
-    return head(b"RAD0", {
-        "version": 1, "type": "gsplat", "count": number, "maxSh": 3, "allChunkBytes": offsets[-1],
-        "chunks": [{"offset": offset, "bytes": len(one)}
-                   for offset, one in zip(offsets, parts, strict=False)],
-        "comment": "made by hand", **more}) + b"".join(parts)
-
 
 @pytest.mark.parametrize(("encodings", "error"), [
     (FLOATS, 1e-6), (HALVES, 5e-3), (DEFAULT, 5e-2), (OTHERS, 5e-2)])
@@ -183,30 +85,6 @@ def test_coefficients_may_lie_in_a_palette(tmp_path: Path) -> None:
         read_splats(path)
 
 
-@pytest.mark.parametrize(("more", "said"), [
-    ({"version": 2}, "version = 2"), ({"count": 7}, "states 7"), ({"chunks": []}, "chunks ="),
-    ({"chunks": [{"offset": 0, "bytes": 1, "filename": "0.radc"}]}, "other files"),
-    ({"chunks": [{"offset": 8, "bytes": 1}]}, "no RADC"), ({"lodTree": True}, "without child_c"),
-    ({"chunks": [{"offset": 0, "bytes": 1}]}, "cut short"),
-    ({"chunks": [{"offset": 0, "bytes": 300}, {"offset": 299, "bytes": 1}]}, "overlap")])
-def test_a_header_that_contradicts_the_file_is_refused(
-    more: dict[str, object], said: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "room.rad"
-    path.write_bytes(rad([chunk(values(), DEFAULT)], N, **more))
-    with pytest.raises(FormatError, match=said) as caught:
-        read_splats(path)
-    assert caught.value.hint
-
-
-@pytest.mark.parametrize("seed", range(60))
-def test_a_damaged_file_is_read_or_refused(seed: int, tmp_path: Path) -> None:
-    path = tmp_path / "room.rad"
-    path.write_bytes(damaged(rad([chunk(values(), (DEFAULT, FLOATS)[seed % 2])], N), seed))
-    with suppress(FormatError):
-        assert len(read_splats(path))
-
-
 def nearest(splats: Splats, others: Splats) -> torch.Tensor:
     """The number of the Gaussian of `others` at the place of each of `splats`."""
     distance, found = cKDTree(others.means.numpy()).query(splats.means.numpy())
@@ -250,13 +128,13 @@ def test_spark_finds_every_gaussian_of_a_written_file(page: WatchedPage, tmp_pat
 
 
 @pytest.mark.parametrize(("change", "said"), [
-    ({"means": float("nan")}, "not finite"), ({"sh_dc": 1e6}, "float16")])
+    ({"means": float("nan")}, "finite"), ({"sh_dc": 1e6}, "float16")])
 def test_what_cannot_be_written_is_refused_and_leaves_no_file(
     change: dict[str, float], said: str, tmp_path: Path
 ) -> None:
     splats = archive_splats.room(20, degree=0)
     for name, value in change.items():
         getattr(splats, name)[3] = value
-    with pytest.raises(FormatError, match=said):
+    with raises(FormatError, said):
         write_rad(tmp_path / "room.rad", splats)
     assert not list(tmp_path.iterdir())

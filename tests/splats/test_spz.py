@@ -140,7 +140,7 @@ def test_what_does_not_fit_is_refused_and_nothing_written(tmp_path):
         write_spz(path, splats)
     with raises(FormatError, "Gaussians"):
         write_spz(path, splats.select(torch.arange(0)))
-    with pytest.raises(ValueError, match="version 1"):
+    with raises(ValueError, "version 1"):
         write_spz(path, few(), version=1)
     assert list(tmp_path.iterdir()) == []
 

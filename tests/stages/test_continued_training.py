@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from facts import assert_facts
+from facts import assert_facts, raises
 from killed import Killed, kill_after
 from tiny_scene import make_inputs
 
 from recon_cli.config.stages import PruneConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.errors import FormatError
 from recon_cli.splats.ply import read_ply
 from recon_cli.stages import prune, train
 from recon_cli.train import plan as planning
@@ -156,6 +157,6 @@ def test_a_damaged_end_of_the_finished_run_is_refused_with_what_to_type(
     for path in finished.iterdir():
         (broken / path.name).write_bytes(path.read_bytes())
     (broken / "final.safetensors").write_bytes(b"\0" * 64)
-    with pytest.raises(Exception, match="cannot be read") as caught:
+    with raises(FormatError, broken / "final.safetensors") as caught:
         go_on(LONG, inputs, broken, tmp_path / "out")
     assert "--again" in caught.value.hint

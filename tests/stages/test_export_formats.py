@@ -8,13 +8,12 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 from facts import raises
 from tiny_stages import CONTEXT, run_export
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.context import StageInputs
-from recon_cli.errors import ConfigError, ReconstructionError, StageError
+from recon_cli.errors import ConfigError, ReconstructionError
 from recon_cli.io.colmap import read_images
 from recon_cli.splats.format import SplatFormat
 from recon_cli.splats.ply import read_ply, read_ply_points, write_ply
@@ -146,16 +145,4 @@ def test_an_unknown_format_is_refused_with_those_that_are_known(text):
         ExportConfig(format=text)
 
 
-def test_without_other_formats_nothing_else_is_written(inputs, tmp_path):
-    summary = run_export(ExportConfig(), inputs, tmp_path, CONTEXT)
-    assert summary.files == {}
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["splats.ply", "transform.json"]
-    assert torch.equal(read_ply(tmp_path / "splats.ply").means,
-                       read_ply(inputs.folders["train"] / "splats.ply").means)
 
-
-def test_a_plan_without_a_scale_is_refused_before_anything_is_written(inputs, tmp_path):
-    with raises(StageError, "scale", "arbitrary") as error:
-        run_export(ExportConfig(format="mesh.ply,plan.svg"), inputs, tmp_path, CONTEXT)
-    assert "--scale-between" in error.value.hint
-    assert not list(tmp_path.iterdir())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import logging
 from dataclasses import replace
@@ -19,9 +18,10 @@ from tiny_stages import run_export
 from recon_cli.config.export import ExportConfig, read_matrix
 from recon_cli.config.stages import RunConfig
 from recon_cli.context import StageContext, StageInputs
-from recon_cli.errors import ConfigError, FormatError
+from recon_cli.errors import ConfigError, FormatError, StageError
+from recon_cli.export.coordinate_frame import choose_frame
 from recon_cli.io.colmap import read_images, read_pinholes, read_points
-from recon_cli.io.training_scene import load_scene
+from recon_cli.io.training_scene import PlacedCapture, load_scene
 from recon_cli.render import render
 from recon_cli.scene.camera import Camera
 from recon_cli.scene.similarity import Similarity
@@ -141,61 +141,68 @@ def test_points_move_with_the_scene(inputs):
     assert np.allclose(points, MOVED.points(solid), atol=1e-5)
 
 
-def test_the_transform_is_recorded_after_the_scale(inputs):
+def test_the_transform_is_recorded_after_the_scale_with_what_was_measured(inputs):
     out, summary = exported(
-        inputs, transform=flat(MOVED), scale_between=("000000.png", "000006.png", 3.0))
+        inputs, transform=flat(MOVED), scale_between=("000000.png", "5,5,5", 3.0))
     record = json.loads((out / "transform.json").read_text())
     assert summary.transform == record["similarity"]
+    assert record["measurement"]["a"] == "000000.png"
     found = Similarity.from_json(record["similarity"])
     ends = np.array([record["measurement"]["a_xyz"], record["measurement"]["b_xyz"]])
     metres = 3.0 / np.linalg.norm(ends[0] - ends[1])
     assert np.allclose(found.matrix, MOVED.matrix @ Similarity(scale=metres).matrix)
 
 
-@pytest.mark.parametrize("name", AXES)
-def test_up_is_the_axis_that_was_asked_for(inputs, name):
-    up_is_z(inputs)
-    _, summary = exported(inputs, up=name)
-    rotation = Similarity.from_json(summary.transform).rotation
-    assert np.array_equal(rotation @ [0, 0, 1], AXES[name])  # to the bit
-    assert np.array_equal(rotation @ [1, 0, 0], [1, 0, 0])  # and nothing else turns
-
 
 @pytest.mark.parametrize("name", AXES)
 def test_where_up_was_not_found_the_cameras_say_it_and_this_is_said(inputs, name, caplog):
     caplog.set_level(logging.WARNING, "recon")
-    _, summary = exported(inputs, up=name)
-    rotation = Similarity.from_json(summary.transform).rotation
-    assert np.allclose(rotation @ [0, -1, 0], AXES[name], atol=1e-6)  # the tiny cameras have y down
+    frame = choose_frame(ExportConfig(up=name), PlacedCapture.read(inputs.folders), None)
+    found = frame.similarity.rotation @ [0, -1, 0]  # the tiny cameras have y down
+    assert np.allclose(found, AXES[name], atol=1e-6)
     assert_facts("\n".join(caplog.messages), "mean", "cameras")
 
 
+COMMENTS = {"z": b"comment Vertical Axis: z\n", "-y": b"", "y": b"comment Vertical Axis: +y\n"}
+
+
 @pytest.mark.parametrize("name", [None, *AXES])
-def test_a_glb_has_y_up_whatever_is_up_in_the_scene(inputs, name):
-    """The highest Gaussian of the scene has the greatest y in the .glb."""
+def test_up_is_the_axis_that_was_asked_for_and_the_files_say_so(inputs, name):
+    """The highest Gaussian of the scene has the greatest y in the .glb, whatever is up."""
     up_is_z(inputs)
-    out, _ = exported(inputs, format="glb", up=name)
+    out, summary = exported(inputs, format="glb,spz", up=name)
+    rotation = Similarity.from_json(summary.transform).rotation
+    assert np.array_equal(rotation @ [0, 0, 1], AXES[name or "z"])  # to the bit
+    assert np.array_equal(rotation @ [1, 0, 0], [1, 0, 0])  # and nothing else turns
     data = (out / "splats.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     value = json.loads(data[20:20 + length])
     at = value["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
     highest = float(read_ply(inputs.folders["train"] / "splats.ply").means[:, 2].max())
     assert value["accessors"][at]["max"][1] == pytest.approx(highest, abs=1e-5)
-
-
-@pytest.mark.parametrize(("name", "comment"), [
-    ("z", b"comment Vertical Axis: z\n"), ("-y", b""), ("y", b"comment Vertical Axis: +y\n")])
-def test_a_ply_and_an_spz_say_which_axis_is_up(inputs, name, comment):
-    up_is_z(inputs)
-    out, _ = exported(inputs, format="spz", up=name)
     head = (out / "splats.ply").read_bytes().partition(b"end_header")[0]
+    comment = COMMENTS[name or "z"]
     assert (b"Vertical Axis" in head) == bool(comment)
     assert comment in head
     header, _ = unpack(out / "splats.spz", (out / "splats.spz").read_bytes())
-    assert (header.axes, header.up) == (None, name)
+    assert (header.version, header.axes, header.up) == (3, None, name or "z")
     # with whatever name, the values are those of the .ply
     back = load_spz(out / "splats.spz").splats
     assert torch.allclose(back.means[:20], read_ply(out / "splats.ply").means[:20], atol=1e-3)
+
+
+@pytest.mark.parametrize("version", [2, 4])
+def test_an_spz_has_the_version_that_was_asked_for(inputs, version):
+    out, _ = exported(inputs, format="spz", spz_version=version)
+    header, _ = unpack(out / "splats.spz", (out / "splats.spz").read_bytes())
+    assert header.version == version
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_a_file_that_names_its_axes_is_checked_in_those(inputs, name):
+    """Reading version 4 turns what has y up; the check of the written file must not."""
+    _, summary = exported(inputs, format="spz", spz_version=4, up=name)
+    assert abs(summary.files["spz"].psnr_change_db) < 0.5
 
 
 @pytest.mark.integration
@@ -215,21 +222,21 @@ def test_a_page_stands_upright_in_any_frame(inputs):
     assert "<title>Tiny</title>" in text
 
 
-BAD = {
-    "mirrors": np.diag([1.0, 1, -1, 1]),
-    "stretches or shears": np.diag([1.0, 2, 1, 1]),
-    "stretches or shears ": np.array([[1.0, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-    "stretches or shears  ": np.diag([0.0, 0, 0, 1]),
-    "last row": np.diag([1.0, 1, 1, 2]),
-    "last row ": np.vstack([np.eye(4)[:3], [0.1, 0, 0, 1]]),
-}
-
-
-@pytest.mark.parametrize("reason", BAD)
-def test_a_matrix_that_is_no_similarity_stops_the_export_before_it_writes(inputs, reason):
-    with pytest.raises(ConfigError, match=reason.strip()) as caught:
-        exported(inputs, transform=tuple(BAD[reason].ravel().tolist()))
-    assert_facts(caught.value.hint, "rotation", "times")
+@pytest.mark.parametrize(("options", "error", "facts", "hint"), [
+    ({"transform": tuple(np.diag([1.0, 2, 1, 1]).ravel().tolist())}, ConfigError, ["stretches"],
+     "rotation"),
+    ({"scale_between": ("000099.png", "000006.png", 1.0)}, ConfigError, ["000009.png"], ""),
+    ({"crop": (1e5, 1e5, 1e5, 2e5, 2e5, 2e5)}, ConfigError, ["Gaussian", "centre"], "and"),
+    ({"max_mb": 1e-4}, ConfigError, ["even"], ""),
+    ({"max_mb": 1.0, "format": "colmap"}, ConfigError, ["--max-mb"], ""),
+    ({"format": "mesh.ply,plan.svg"}, StageError, ["scale", "arbitrary"], "--scale-between"),
+])
+def test_what_cannot_be_exported_is_refused_before_anything_is_written(
+    inputs, options, error, facts, hint
+):
+    with raises(error, *facts) as caught:
+        exported(inputs, **options)
+    assert hint in caught.value.hint
     assert list((inputs.folders["train"].parent / "out").iterdir()) == []
 
 
@@ -273,14 +280,6 @@ def test_a_file_that_is_missing_or_no_json_is_refused(tmp_path):
         with raises(FormatError, "JSON"):
             read_matrix(str(tmp_path / name))
 
-
-@pytest.mark.parametrize("version", [2, 3, 4])
-def test_an_spz_has_the_version_that_was_asked_for(inputs, version):
-    out, _ = exported(inputs, format="spz", spz_version=version)
-    data = (out / "splats.spz").read_bytes()
-    if version < 4:
-        data = gzip.decompress(data)
-    assert (data[:4], data[4]) == (b"NGSP", version)
 
 
 def test_a_version_of_spz_that_is_not_written_is_refused():

@@ -16,7 +16,7 @@ from tiny_stages import CONFIG, CONTEXT, PRUNE, holding_out, mean_colour_psnr, r
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import PruneConfig, RunConfig
 from recon_cli.context import TrainCallback
-from recon_cli.errors import FormatError, StageError, TrainingError
+from recon_cli.errors import FormatError, StageError, TrainingError, WorkspaceError
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import export, prune, train
 from recon_cli.train import finished_model
@@ -162,7 +162,7 @@ def test_an_export_that_reads_back_differently_fails(inputs, tmp_path, monkeypat
         write_ply(path, changed, *extra, **comments)
 
     monkeypatch.setattr(export, "write_ply", lossy)
-    with pytest.raises(Exception, match="reads back"):
+    with raises(WorkspaceError, "means"):
         run(export, ExportConfig(), inputs, tmp_path / "out")
 
 

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from facts import raises
 from safetensors.torch import load_file
 from scenes import random_splats, with_harmonics
 from tiny_scene import make_inputs
@@ -12,6 +13,7 @@ from tiny_stages import run_export
 from recon_cli.config.export import ExportConfig
 from recon_cli.config.stages import EvaluateConfig, PruneConfig, RunConfig, TrainConfig
 from recon_cli.context import StageContext, StageInputs
+from recon_cli.errors import WorkspaceError
 from recon_cli.export import verify
 from recon_cli.splats.ply import read_ply, write_ply
 from recon_cli.stages import evaluate, export, prune, train
@@ -105,5 +107,5 @@ def test_an_export_of_any_degree_and_share_is_read_back(tmp_path, degree, colore
     verify.verify_ply(tmp_path / "out" / "splats.ply", splats)
     write_ply(tmp_path / "out" / "splats.ply", with_harmonics(splats, degree, 0))
     if colored and degree:
-        with pytest.raises(Exception, match="different sh_rest"):
+        with raises(WorkspaceError, "splats.ply", "sh_rest"):
             verify.verify_ply(tmp_path / "out" / "splats.ply", splats)

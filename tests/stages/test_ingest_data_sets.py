@@ -68,7 +68,7 @@ def test_poses_that_are_turns_alone_are_said_and_not_used(tmp_path, notices, apa
     summary = take(folder, tmp_path / "out")
     assert (tmp_path / "out" / POSES).exists() == kept
     assert (summary.metric is not None) == kept
-    assert any("stand in one place" in text for text in notices()) != kept
+    assert any("place" in text for text in notices()) != kept
 
 
 def test_depth_of_views_that_are_held_out_lends_no_points(tmp_path):
@@ -259,7 +259,7 @@ def test_depth_in_another_unit_gives_points_where_the_room_is(
     assert (low > -0.3).all()
     assert (high < (5.2, 4.5, 2.9)).all()  # the room is 4.9 x 4.2 x 2.6 m
     assert (high - low).max() > 3
-    assert any("The depth fits the poses in" in text for text in notices()) == (unit != 1e-3)
+    assert any("The depth fits" in text for text in notices()) == (unit != 1e-3)
 
 
 @pytest.mark.integration
@@ -270,7 +270,7 @@ def test_depth_that_fits_in_no_unit_gives_neither_points_nor_metres(
     summary = take(folder, tmp_path / "out")
     assert not summary.metric
     assert summary.points is None
-    assert any("The depth is not used" in text and "25 times" in text for text in notices())
+    assert_facts("\n".join(notices()), "depth", "not", 25)
 
 
 def test_depth_that_nothing_shows_leaves_the_unit_open(tmp_path, notices):

@@ -64,7 +64,7 @@ def test_a_video_that_lost_nearly_all_is_refused(tmp_path):
     start = data.index(b"mdat") + 2000
     data[start:] = bytes(len(data) - start)
     video.write_bytes(data)
-    with pytest.raises(InputError, match=r"frames of 40|No frame"):
+    with raises(InputError, "frame", video):
         take(video, tmp_path / "out")
 
 
@@ -81,17 +81,16 @@ def test_a_video_of_two_frames_is_refused(tmp_path):
         take(video, tmp_path / "out")
 
 
-@pytest.mark.parametrize(("value", "words"), [
-    (0, "dark.mp4 is too dark"), (255, "dark.mp4 is over-exposed"), (128, "dark.mp4 is flat")])
-def test_a_video_that_shows_nothing_is_refused_with_the_reason(tmp_path, value, words):
+@pytest.mark.parametrize(("value", "fault"), [(0, "dark"), (255, "over-exposed"), (128, "flat")])
+def test_a_video_that_shows_nothing_is_refused_with_the_reason(tmp_path, value, fault):
     video = write_video(tmp_path / "dark.mp4", [np.full((96, 128, 3), value, np.uint8)] * 40)
-    with pytest.raises(InputError, match=words):
+    with raises(InputError, "dark.mp4", fault):
         take(video, tmp_path / "out")
 
 
 def test_a_video_from_a_tripod_is_refused(tmp_path):
     video = write_video(tmp_path / "still.mp4", [blocks(96, 128)] * 40)
-    with pytest.raises(InputError, match=r"still\.mp4 does not move: .*\b40 frames"):
+    with raises(InputError, "still.mp4", 40):
         take(video, tmp_path / "out")
 
 
@@ -100,7 +99,7 @@ def test_a_video_that_is_dark_for_the_most_part_is_told(tmp_path, notices):
     lit = walk(30)
     take(write_video(tmp_path / "room.mp4", [*lit[:10], *(frame // 64 for frame in lit[10:])]),
          tmp_path / "out")
-    assert_facts(notices()[0], "20 of 30 frames", "room.mp4", "black")
+    assert_facts(notices()[0], "20 of 30", "room.mp4", "black")
 
 
 @pytest.mark.integration
@@ -108,7 +107,7 @@ def test_adjacent_frames_are_warned_of(tmp_path, notices):
     wide = blocks(384, 560)  # a third of a percent of the width a frame, as at 60 a second
     take(write_video(tmp_path / "short.mp4", [wide[:, i:i + 384] for i in range(12)]),
          tmp_path / "out")
-    assert "hardly moves" in notices()[0]
+    assert_facts(notices()[0], "short.mp4", "moves")
 
 
 def test_copies_of_one_photo_are_refused(tmp_path):
@@ -227,7 +226,7 @@ def test_a_full_disk_leaves_no_half_written_frame(video, tmp_path, monkeypatch, 
         flush(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with raises(OSError, errno.ENOSPC):
         take(source, tmp_path / "out")
     left = sorted((tmp_path / "out" / "frames").iterdir())
     assert 0 < len(left) <= 3

@@ -83,7 +83,7 @@ def test_colours_and_lenses_that_are_corrected_are_told(tmp_path, notices):
     take(folder, tmp_path / "out")
     told = "\n".join(notices())
     assert_facts(told, "1 photo", "Adobe RGB")
-    assert_facts(told, "3 RAW photos", "1.75")
+    assert_facts(told, 3, "RAW", "1.75")
 
 
 def test_raw_photos_of_one_name_in_two_folders_are_developed_each(tmp_path):

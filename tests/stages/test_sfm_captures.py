@@ -40,7 +40,7 @@ def test_of_two_clips_that_do_not_meet_the_larger_is_kept_and_the_other_named(
     assert summary.models == (10, 6)
     # No match ties the two together, so that no further way is worth trying.
     assert [attempt.name for attempt in summary.attempts] == ["exhaustive"]
-    assert_facts(caplog.text, "disconnected models", "6 frames", "used")
+    assert_facts(caplog.text, "disconnected", 6, "frames")
     assert "living000000.png" in caplog.text
 
 

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from facts import assert_facts
+from facts import assert_facts, raises
 
 from recon_cli.evaluation.metrics import corrected_psnr
 from recon_cli.train.parts.decisions import LEAST_SCORED, Rule, decide, skip_trial, split
@@ -66,9 +66,9 @@ def test_an_arm_that_broke_down_keeps_the_part_off():
 
 
 def test_arms_that_do_not_pair_are_refused():
-    with pytest.raises(ValueError, match="scores"):
+    with raises(ValueError, "scores"):
         decide("part", (lambda: [20.0, 21.0], lambda: [20.0]))
-    with pytest.raises(ValueError, match="scores"):
+    with raises(ValueError, "scores"):
         decide("part", (lambda: [20.0], lambda: [21.0]))
 
 

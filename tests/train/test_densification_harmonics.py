@@ -72,3 +72,23 @@ def test_a_run_takes_harmonics_from_no_gaussian():
     state = first_state(config, backend="numba")
     fit(state, tiny_task(config, backend="numba"), 45)
     assert len(state.splats.sh_rest) == len(state.splats)
+
+
+def test_a_budget_leaves_gaussians_in_spatial_order_with_their_moments(monkeypatch):
+    monkeypatch.setattr(densification, "densify_budget", lambda splats, *_: (
+        splats.map(torch.Tensor.detach), torch.arange(len(splats))))
+    state, task = first_state(colored=COLORED), tiny_task()
+    with torch.no_grad():
+        state.splats.means.zero_()
+        state.splats.means[:, 0] = torch.randperm(N, generator=generator()).float()
+    before = state.splats.means[:, 0].detach().clone()
+    for name, value in state.optimizer.tensors().items():
+        if name.endswith("exp_avg"):
+            value.copy_(before[:len(value)].reshape(-1, *[1] * (value.dim() - 1)).expand_as(value))
+    state.iteration = task.schedule.config.densify_every
+    densification.STRATEGIES["budget"].control(state, task)
+    place, moments = state.splats.means[:, 0].detach(), state.optimizer.tensors()
+    assert torch.equal(place[:COLORED], before[:COLORED].sort().values)
+    assert torch.equal(place[COLORED:], before[COLORED:].sort().values)
+    assert torch.equal(moments["adam.quats.exp_avg"][:, 0], place)
+    assert torch.equal(moments["adam.sh_rest.exp_avg"][:, 0, 0], place[:COLORED])

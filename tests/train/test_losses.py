@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from facts import raises
 from skimage.metrics import structural_similarity
 
 from recon_cli.kernels.thread_pool import pool
@@ -233,12 +234,12 @@ def test_one_pixel_that_is_not_finite_shows_in_the_fused_loss(pixel, ssim_weight
 
 def test_images_that_do_not_fill_a_vector_are_refused():
     for width in (1, MIN_WIDTH - 1):
-        with pytest.raises(ValueError, match=f"{width} pixels wide, needed at least {MIN_WIDTH}"):
+        with raises(ValueError, width, MIN_WIDTH):
             fused(*bytes_and_render(20, width), 0.2)
     assert np.isfinite(fused(*bytes_and_render(20, MIN_WIDTH), 0.2)[0])
 
 
 def test_arrays_of_another_size_are_refused():
     image, truth = bytes_and_render(20, 30)
-    with pytest.raises(ValueError, match="do not fit an image of 30x20"):
+    with raises(ValueError, "30x20"):
         fused(image[:-1], truth, 0.2)

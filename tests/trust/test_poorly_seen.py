@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from facts import assert_facts
 from small_room import dots
 
-from recon_cli.trust.poorly_seen import PoorlySeenRegion, find_poorly_seen
+from recon_cli.trust.poorly_seen import find_poorly_seen
+from recon_cli.trust.records import PoorlySeenRegion
 from recon_cli.trust.support import ViewSupport
 from recon_cli.trust.surface import find_cells
 
@@ -82,8 +84,6 @@ def test_where_all_is_well_seen_or_nothing_is_seen_there_is_no_region():
 def test_a_region_is_described_by_its_cause():
     one = PoorlySeenRegion(position=(1.0, 2.0, 0.5), size=1.25, share=0.031, few=True, views=1,
                            span_deg=0.0, frame="a.png")
-    said = one.describe("m")
-    assert "at 1.00 2.00 0.50, 1.2 m across, 3.1% of the surface" in said
-    assert "only 1 view shows it; a.png" in said
+    assert_facts(one.describe("m"), "1.00 2.00 0.50", "1.2 m", "3.1%", "1 view", "a.png")
     narrow = PoorlySeenRegion(**{**vars(one), "few": False, "views": 7, "span_deg": 4.2})
-    assert "7 views show it, from directions only 4 degrees apart" in narrow.describe("m")
+    assert_facts(narrow.describe("m"), "7 views", "4 degrees")

@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from facts import raises
+from facts import assert_facts, raises
 from viewing import opened, until, view
 
 from recon_cli.errors import WorkspaceError
@@ -60,8 +60,8 @@ def test_a_path_never_takes_the_place_of_another_and_a_full_disk_is_told(tmp_pat
     path = CameraPath(np.tile(np.eye(4), (2, 1, 1)), np.array([50.0, 50.0]), 64, 48, 30.0)
     folder = PathFolder(tmp_path, tmp_path)
     for number in (1, 2):
-        assert f"path-{number}.json --out path-{number}.mp4" in folder.save(path)
-    assert "Programs that read" in PathFolder(tmp_path, None).save(path)
+        assert_facts(folder.save(path), f"path-{number}.json", f"--out path-{number}.mp4")
+    assert "recon" not in PathFolder(tmp_path, None).save(path)
     assert sorted(file.name for file in tmp_path.iterdir()) == [
         "path-1.json", "path-2.json", "path-3.json"]
 

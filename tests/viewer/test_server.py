@@ -4,7 +4,7 @@ import socket
 import threading
 
 import pytest
-from facts import raises
+from facts import assert_facts, raises
 
 from recon_cli.errors import ConfigError
 from recon_cli.viewer import server
@@ -41,7 +41,7 @@ def test_no_free_port_at_all_is_an_error(monkeypatch):
 
 @pytest.mark.parametrize("host", ["no.such.host.invalid", "203.0.113.7"])
 def test_an_address_that_is_not_of_this_machine_is_an_error(host):
-    with pytest.raises(ConfigError, match=host.replace(".", r"\.")) as raised:
+    with raises(ConfigError, host) as raised:
         start_server(host, None, label="x").__enter__()
     assert "--host" in raised.value.hint
 
@@ -59,7 +59,7 @@ def test_a_server_for_all_says_so_and_one_for_this_machine_does_not(caplog):
     with start_server(HOST, None, label="x"):
         assert not caplog.records
     with start_server("0.0.0.0", None, label="x") as (_, address):
-        assert "everyone who can reach this machine" in caplog.text
+        assert_facts(caplog.text, "everyone")
     assert address.startswith("http://127.0.0.1:")
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from facts import assert_facts
 
 from recon_cli.cli import main
 from recon_cli.commands import view
@@ -95,7 +96,7 @@ def test_a_port_that_is_taken_is_refused(room, capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["view", str(room), "--port", str(port)]) == 2
-    assert f"the port {port} is in use" in capsys.readouterr().err.lower()
+    assert_facts(capsys.readouterr().err, "error:", "port", port)
 
 
 @pytest.mark.integration

@@ -41,20 +41,16 @@ def test_a_file_is_flushed_before_it_replaces_the_old_one(
 
 
 @pytest.mark.parametrize(("text", "reason"), [
-    ("NaN", "not a finite number"), ('{"a": Infinity}', "not a finite number"),
-    ("1e999", "not a finite number"), ("9" * 5000, "not a finite number"),
-    ("[" * 100_000, "nested too deeply"), ('{"a":' * 100_000, "nested too deeply"),
-    ("{", "Expecting"), ("", "Expecting"), ("[]", "a list, not an object"),
-    ("3", "a single value, not an object")])
+    ("NaN", "finite"), ('{"a": Infinity}', "finite"), ("1e999", "finite"), ("9" * 5000, "finite"),
+    ("[" * 100_000, "nested"), ('{"a":' * 100_000, "nested"),
+    ("{", "Expecting"), ("", "Expecting"), ("[]", "list"), ("3", "value")])
 def test_json_that_cannot_be_used_is_an_error_with_its_reason(
     tmp_path: Path, text: str, reason: str
 ) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
-    with pytest.raises(FormatError, match=reason) as caught:
+    with raises(FormatError, path, reason):
         read_json(path, dict)
-    assert str(path) in caught.value.message
-    assert caught.value.hint
 
 
 def test_bytes_folders_fifos_and_huge_files_are_no_json(

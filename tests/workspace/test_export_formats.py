@@ -3,6 +3,7 @@
 from importlib import import_module
 
 import pytest
+from facts import assert_facts
 
 from recon_cli.config.export import ExportConfig
 from recon_cli.splats.format import SplatFormat
@@ -30,4 +31,4 @@ def test_own_options_of_a_format_are_options_of_export():
 
 
 def test_the_help_says_what_each_format_may_lose():
-    assert describe_max_loss() == "0.3; 3 for .splat, which has no harmonics"
+    assert_facts(describe_max_loss(), 0.3, 3, ".splat")

@@ -114,16 +114,19 @@ def test_a_renamed_photo_is_named_among_the_reasons(tmp_path: Path) -> None:
     (tmp_path / "p" / "a.jpg").rename(tmp_path / "p" / "c.jpg")
     (tmp_path / "p" / "b.jpg").write_text("changed")
     after = ResultKey("ingest", 1, {}, (read_source(tmp_path / "p", without=tmp_path),), {})
-    assert differences(before, after, section="ingest") == [
-        "the input p/a.jpg is gone", "the input p/b.jpg changed", "the input p/c.jpg is new"]
+    for reason, name, change in zip(differences(before, after, section="ingest"), "abc",
+                                    ("gone", "changed", "new"), strict=True):
+        assert_facts(reason, f"p/{name}.jpg", change)
 
 
 def test_options_that_another_version_knew_or_did_not_know_are_named() -> None:
     before = ResultKey("export", 1, {"gone": None, "kept": 1.5}, (), {})
     after = ResultKey("export", 1, {"kept": 2.0, "crop": None}, (), {})
-    assert differences(before, after, section="export") == ["export.kept changed: 1.5 -> 2"]
-    assert version_differences(before, after, section="export") == [
-        "option export.crop is new", "option export.gone no longer exists"]
+    (reason,) = differences(before, after, section="export")
+    assert_facts(reason, "export.kept", 1.5, 2)
+    new, gone = version_differences(before, after, section="export")
+    assert_facts(new, "export.crop", "new")
+    assert_facts(gone, "export.gone")
 
 
 def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> None:
@@ -133,11 +136,11 @@ def test_outputs_changed_by_hand_or_missing_are_named(workspace: Workspace) -> N
     os.utime(data, ns=(5, 5))
     assert find_changed_outputs(workspace.folder("train"), manifest, ()) == []
     data.write_text("edited")
-    assert find_changed_outputs(workspace.folder("train"), manifest, ()) == [
-        "output sub/data.txt was changed by hand"]
+    (reason,) = find_changed_outputs(workspace.folder("train"), manifest, ())
+    assert_facts(reason, "sub/data.txt", "hand")
     data.unlink()
-    assert find_changed_outputs(workspace.folder("train"), manifest, ()) == [
-        "output sub/data.txt is missing"]
+    (reason,) = find_changed_outputs(workspace.folder("train"), manifest, ())
+    assert_facts(reason, "sub/data.txt", "missing")
     assert find_changed_outputs(workspace.folder("train"), manifest, ("sub/*",)) == []
 
 
@@ -363,8 +366,8 @@ def test_what_a_killed_report_left_is_a_scrap(workspace: Workspace) -> None:
 
 
 def test_a_full_disk_is_said_with_the_space_left(tmp_path: Path) -> None:
-    said = pytest.raises(WorkspaceError, match=r"full while running train: [\d.]+ MB free")
-    with said, disk_errors(tmp_path, "running train"):
+    with (raises(WorkspaceError, "disk", "running train", "MB"),
+          disk_errors(tmp_path, "running train")):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 

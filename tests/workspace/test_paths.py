@@ -41,9 +41,8 @@ def test_a_pipe_a_device_and_a_socket_are_named(tmp_path, pipe, monkeypatch):
         bound.bind("socket")
         for path, kind in ((pipe, "named pipe"), (Path("link"), "device"),
                            (Path("/dev/null"), "device"), (Path("socket"), "socket")):
-            with pytest.raises(FormatError, match=kind) as raised:
+            with raises(FormatError, kind):
                 refuse_special(path)
-            assert raised.value.hint
 
 
 @pytest.mark.parametrize("read", [

@@ -1,5 +1,4 @@
 import json
-import re
 
 import cv2
 import numpy as np
@@ -121,7 +120,7 @@ def test_frames_are_stored_without_loss_as_rgb(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"\x89PNG"])
 def test_a_broken_frame_is_no_picture(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
-    with pytest.raises(FormatError, match=re.escape(str(tmp_path / "a.png"))):
+    with raises(FormatError, tmp_path / "a.png"):
         read_png(tmp_path / "a.png")
 
 

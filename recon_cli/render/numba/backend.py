@@ -5,7 +5,6 @@ Its kernels are loaded from the cache, or compiled under a progress bar, before 
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,7 +19,8 @@ from torch import Tensor
 from recon_cli.machine import POLL_SECONDS
 from recon_cli.render.contract import (
     RenderOutput, Statistics, StepOptions, TargetImage)
-from recon_cli.kernels.kernel import CODE, cache_folder, unsaved
+from recon_cli.kernels.kernel import CODE, READY, cache_folder, unsaved, without_scipy
+from recon_cli.kernels.kernel import is_warm as is_warm
 from recon_cli.render.numba.optimizer import step
 from recon_cli.render.numba.step import PhotometricStep
 from recon_cli.kernels.thread_pool import pool
@@ -30,8 +30,6 @@ from recon_cli.scene.camera import Camera
 from recon_cli.scene.splats import Splats
 
 KERNELS = 12  # that threads share; the progress counts these
-_SCIPY = "scipy.linalg"
-_READY = "ready"  # file in the cache folder once every kernel is there
 
 
 def render(
@@ -106,20 +104,13 @@ class _Render(torch.autograd.Function):
             PackedSplats.from_tensors(tensors), PackedSplats.from_tensors(gradients),
             ImageBuffers(flat(grad_rgb), *(nothing if gradient is None else flat(gradient)
                                            for gradient in (grad_alpha, grad_depth))),
-            ctx.statistics,
-            details=True, loo=ctx.scores)
+            ctx.statistics, loo=ctx.scores)
         if ctx.statistics.keep_ellipses:
             ctx.statistics.ellipses = ctx.lease.view_pass.ellipse_gradients()
         grad_background = None
         if ctx.needs_input_grad[0]:
             grad_background = (grad_rgb * (1 - ctx.alpha)[..., None]).sum((0, 1))
         return (grad_background, None, None, None, *gradients)
-
-
-def is_warm() -> bool:
-    """Tells whether machine code for this CPU is there."""
-    folder = cache_folder()
-    return folder is not None and (folder / _READY).exists()
 
 
 def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
@@ -145,14 +136,14 @@ def warm_up(on_kernel: Callable[[], None] = lambda: None) -> float:
     folder = cache_folder()
     before, pool.observer = pool.observer, observe
     try:
-        with _without_scipy():
+        with without_scipy():
             if folder is None or is_warm():
                 _run_all()
             else:
                 with _writing(folder, lambda: count(len([*folder.rglob(f"*{CODE}")]))):
                     _run_all()
                     if not unsaved:
-                        (folder / _READY).touch()
+                        (folder / READY).touch()
     finally:
         pool.observer = before
     return time.perf_counter() - start
@@ -175,19 +166,6 @@ def _writing(folder: Path, on_wait: Callable[[], None] = lambda: None) -> Iterat
         yield
     finally:
         lock.release()
-
-
-@contextmanager
-def _without_scipy() -> Iterator[None]:
-    """Keeps numba from importing scipy.linalg, slowly, for a BLAS that no kernel needs."""
-    if _SCIPY in sys.modules:
-        yield
-        return
-    sys.modules[_SCIPY] = None  # type: ignore[assignment]  # an import of it fails at once
-    try:
-        yield
-    finally:
-        del sys.modules[_SCIPY]
 
 
 def _run_all() -> None:

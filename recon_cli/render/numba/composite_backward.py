@@ -9,8 +9,9 @@ what is composited behind it, the remainder of Kerbl et al. 2023 in scalar form:
 s is zero where alpha was clamped. Gradients by mean and covariance are moments of s in the whitened
 coordinates (u, v), which are of order one even for needles.
 
-An instance is the outer loop: its sums stay in registers while its patches pass by, and go to a
-slot of its own at the end: no atomics and the same bits every time.
+An instance is the outer loop: its sums go to a slot of its own at the end: no atomics and the same
+bits every time. v depends on the row of a pixel alone, so that the moments of a row of patches are
+made of three sums; more than nine sums at once do not stay in the sixteen registers of AVX2.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from __future__ import annotations
 import numpy as np
 
 from recon_cli.render.numba.compositing import (
-    BATCH_FLOATS, LOCAL, load_instance, log2_alpha, patch_pixels, pixel)
-from recon_cli.kernels.kernel import kernel
+    BATCH_FLOATS, LOCAL, load_instance, log2_alpha, patch_pixels, pixel, row_terms)
+from recon_cli.kernels.kernel import inlined, kernel
 from recon_cli.kernels.simd import LANES
 from recon_cli.kernels.simd_functions import (
-    bits, broadcast, exp2, fetch_add, fill, fma, largest, load, lowest_bit,
-    minimum, select, store, totals)
+    bits, broadcast, count_bits, exp2, fetch_add, fill, fma, lane_numbers, largest, load,
+    lowest_bit, minimum, select, store, totals)
 from recon_cli.render.numba.soa import (
-    BATCH, BLUE, DEPTH, GREEN, LOG2_ALPHA_MAX, PATCHES, RED, SLOT, TILE_HEIGHT, TILE_PIXELS,
-    TILE_WIDTH)
+    BATCH, BLUE, DEPTH, GREEN, LOG2_ALPHA_MAX, PATCHES, PATCHES_X, RED, SLOT, TILE_HEIGHT,
+    TILE_PIXELS, TILE_WIDTH, U_X)
 
 _T, _R, _LAST, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH = (i * TILE_PIXELS for i in range(7))
 _BEHIND_RED, _BEHIND_GREEN, _BEHIND_BLUE = (i * TILE_PIXELS for i in range(7, 10))
@@ -40,13 +41,12 @@ BACKWARD_FLOATS = _BATCH + BATCH_FLOATS
 @kernel
 def composite_backward(counter, tile_start, members, slots, records, width, height, tiles_x,
                        cutoff, background, final, last, met, grad_rgb, grad_alpha, grad_depth,
-                       details, scores, counting, sums, scratch):
+                       scores, counting, sums, scratch):
     """Sums the gradients of every instance over the pixels of its tile.
 
     The arguments are those of `compositing.composite`, and `grad_*`, dL/d(rgb, alpha, depth), the
-    latter two empty for zeros. Written are `sums` [E * 16] by slot, see `soa`: with `details` also
-    s^2 and the fragments, with `scores` what leaving one out would change, over
-    `counting`.
+    latter two empty for zeros. Written are `sums` [E * 16] by slot, see `soa`: with `scores` also
+    what leaving one out would change, over `counting`.
     """
     has_alpha, has_depth = len(grad_alpha) > 0, len(grad_depth) > 0
     tiles = len(tile_start) - 1
@@ -74,28 +74,25 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                 store(scratch, _BEHIND_RED + at, broadcast(background, 0))
                 store(scratch, _BEHIND_GREEN + at, broadcast(background, 1))
                 store(scratch, _BEHIND_BLUE + at, broadcast(background, 2))
-        for r in range(TILE_HEIGHT):
-            y = top + r
-            for i in range(TILE_WIDTH):
-                at = pixel(i, r)
-                if y < height and left + i < width:
-                    p = y * width + left + i
-                    red, green, blue = grad_rgb[3 * p], grad_rgb[3 * p + 1], grad_rgb[3 * p + 2]
-                    scratch[_G_RED + at] = red
-                    scratch[_G_GREEN + at] = green
-                    scratch[_G_BLUE + at] = blue
-                    behind = red * background[0] + green * background[1] + blue * background[2]
-                    if has_alpha:  # coverage is 1 - T at the end: a colour of -1 behind all
-                        behind -= grad_alpha[p]
-                    scratch[_R + at] = behind
-                    if scores:
-                        counts = len(counting) == 0 or counting[p]
-                        scratch[_COUNTS + at] = np.float32(1 if counts else 0)
-                    if has_depth:
-                        scratch[_G_DEPTH + at] = grad_depth[p]
-                else:
-                    for plane in (_G_RED, _G_GREEN, _G_BLUE, _R, _G_DEPTH, _COUNTS):
-                        scratch[plane + at] = np.float32(0)
+        rows, columns = min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left)
+        if rows * columns < TILE_PIXELS:  # nothing comes from beyond the image
+            for plane in (_R, _G_RED, _G_GREEN, _G_BLUE, _G_DEPTH, _COUNTS):
+                for at in range(plane, plane + TILE_PIXELS, LANES):
+                    store(scratch, at, zero)
+        for r in range(rows):
+            for i in range(columns):
+                p, at = (top + r) * width + left + i, pixel(i, r)
+                red, green, blue = grad_rgb[3 * p], grad_rgb[3 * p + 1], grad_rgb[3 * p + 2]
+                scratch[_G_RED + at], scratch[_G_GREEN + at] = red, green
+                scratch[_G_BLUE + at] = blue
+                behind = red * background[0] + green * background[1] + blue * background[2]
+                if has_alpha:  # coverage is 1 - T at the end: a colour of -1 behind all
+                    behind -= grad_alpha[p]
+                scratch[_R + at] = behind
+                if scores:
+                    scratch[_COUNTS + at] = np.float32(len(counting) == 0 or counting[p])
+                if has_depth:
+                    scratch[_G_DEPTH + at] = grad_depth[p]
         end = begin + np.int64(deepest)
         for e in range(end, tile_start[tile + 1]):
             for i in range(0, SLOT, LANES):
@@ -110,63 +107,85 @@ def composite_backward(counter, tile_start, members, slots, records, width, heig
                 for patch in range(0, PATCHES, LANES):
                     needed |= bits(load(scratch, _LIMITS + patch) >= number) << np.uint64(patch)
                 needed &= np.uint64(met[first + k])
+                i = k * LOCAL
                 g_red, g_green, g_blue, g_depth = zero, zero, zero, zero
                 s_0, s_u, s_v, s_uu, s_uv, s_vv = zero, zero, zero, zero, zero, zero
-                squared, hits, loo = zero, zero, zero
-                i = k * LOCAL
+                squared, hits, loo = zero, np.int64(0), zero
+                if scores:
+                    loo = leave_out(scratch, batch, i, needed, number, cutoff)
+                u_x, depth = broadcast(batch, i + U_X), broadcast(batch, i + DEPTH)
+                own_red, own_green = broadcast(batch, i + RED), broadcast(batch, i + GREEN)
+                own_blue = broadcast(batch, i + BLUE)
                 while needed != 0:
-                    at = lowest_bit(needed) * LANES
-                    needed &= needed - np.uint64(1)
-                    u, v, power = log2_alpha(
-                        batch, i, load(scratch, _COLUMN + at), load(scratch, _ROW + at))
-                    a = exp2(minimum(power, LOG2_ALPHA_MAX))
-                    part = (power >= cutoff) & (load(scratch, _LAST + at) >= number)
-                    a = select(part, a, 0.0)
-                    T = load(scratch, _T + at) / (1.0 - a)
-                    store(scratch, _T + at, T)
-                    weight = a * T
-                    red, green = load(scratch, _G_RED + at), load(scratch, _G_GREEN + at)
-                    blue = load(scratch, _G_BLUE + at)
-                    shade = fma(red, broadcast(batch, i + RED),
-                                fma(green, broadcast(batch, i + GREEN),
-                                    blue * broadcast(batch, i + BLUE)))
-                    if has_depth:
-                        z = load(scratch, _G_DEPTH + at)
-                        shade = fma(z, broadcast(batch, i + DEPTH), shade)
-                        g_depth = fma(weight, z, g_depth)
-                    R = load(scratch, _R + at)
-                    slope = shade - R
-                    store(scratch, _R + at, fma(a, slope, R))
-                    g_red, g_green = fma(weight, red, g_red), fma(weight, green, g_green)
-                    g_blue = fma(weight, blue, g_blue)
-                    s = select(power <= LOG2_ALPHA_MAX, weight * slope, 0.0)
-                    su, sv = s * u, s * v
-                    s_0, s_u, s_v = s_0 + s, s_u + su, s_v + sv
-                    s_uu, s_uv, s_vv = fma(su, u, s_uu), fma(su, v, s_uv), fma(sv, v, s_vv)
-                    if details:
+                    patch = lowest_bit(needed) & ~(PATCHES_X - 1)  # the first of its row
+                    in_row = needed >> np.uint64(patch) & np.uint64((1 << PATCHES_X) - 1)
+                    needed ^= in_row << np.uint64(patch)
+                    base = patch * LANES
+                    u_row, v, power_row = row_terms(batch, i, load(scratch, _ROW + base))
+                    r_0, r_u, r_uu = zero, zero, zero
+                    while in_row != 0:
+                        at = lowest_bit(in_row) * LANES
+                        in_row &= in_row - np.uint64(1)
+                        u = fma(u_x, load(scratch, _COLUMN + at), u_row)
+                        power = fma(-u, u, power_row)
+                        at += base
+                        a = exp2(minimum(power, LOG2_ALPHA_MAX))
+                        part = (power >= cutoff) & (load(scratch, _LAST + at) >= number)
+                        a = select(part, a, 0.0)
+                        T = load(scratch, _T + at) / (1.0 - a)
+                        store(scratch, _T + at, T)
+                        weight = a * T
+                        red, green = load(scratch, _G_RED + at), load(scratch, _G_GREEN + at)
+                        blue = load(scratch, _G_BLUE + at)
+                        shade = fma(red, own_red, fma(green, own_green, blue * own_blue))
+                        if has_depth:
+                            z = load(scratch, _G_DEPTH + at)
+                            shade = fma(z, depth, shade)
+                            g_depth = fma(weight, z, g_depth)
+                        R = load(scratch, _R + at)
+                        slope = shade - R
+                        store(scratch, _R + at, fma(a, slope, R))
+                        g_red, g_green = fma(weight, red, g_red), fma(weight, green, g_green)
+                        g_blue = fma(weight, blue, g_blue)
+                        s = select(power <= LOG2_ALPHA_MAX, weight * slope, 0.0)
+                        su = s * u
+                        r_0, r_u, r_uu = r_0 + s, r_u + su, fma(su, u, r_uu)
                         squared = fma(s, s, squared)
-                        hits = hits + select(part, 1.0, zero)
-                    if scores:
-                        behind = load(scratch, _BEHIND_RED + at)
-                        away = broadcast(batch, i + RED) - behind
-                        store(scratch, _BEHIND_RED + at, fma(a, away, behind))
-                        error = away * away
-                        behind = load(scratch, _BEHIND_GREEN + at)
-                        away = broadcast(batch, i + GREEN) - behind
-                        store(scratch, _BEHIND_GREEN + at, fma(a, away, behind))
-                        error = fma(away, away, error)
-                        behind = load(scratch, _BEHIND_BLUE + at)
-                        away = broadcast(batch, i + BLUE) - behind
-                        store(scratch, _BEHIND_BLUE + at, fma(a, away, behind))
-                        error = fma(away, away, error)
-                        loo = fma(weight * weight * load(scratch, _COUNTS + at), error, loo)
+                        hits += count_bits(bits(part))
+                    sv = r_0 * v
+                    s_0, s_u, s_v = s_0 + r_0, s_u + r_u, s_v + sv
+                    s_uu, s_uv, s_vv = s_uu + r_uu, fma(r_u, v, s_uv), fma(sv, v, s_vv)
+                counted = select(lane_numbers() < 1.0, fill(np.float32(hits)), 0.0)
                 to = np.int64(slots[first + k]) * SLOT
                 if LANES == 16:
                     store(sums, to, totals((
                         g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu, s_uv, s_vv,
-                        squared, hits, loo, zero, zero, zero)))
+                        squared, counted, loo, zero, zero, zero)))
                 else:
                     store(sums, to, totals((g_red, g_green, g_blue, g_depth, s_0, s_u, s_v, s_uu)))
                     store(sums, to + 8, totals((
-                        s_uv, s_vv, squared, hits, loo, zero, zero, zero)))
+                        s_uv, s_vv, squared, counted, loo, zero, zero, zero)))
             end = first
+
+
+@inlined
+def leave_out(scratch, batch, i, needed, number, cutoff):
+    """Returns the squared error of leaving an instance out, and puts it before what is behind."""
+    loo = fill(0.0)
+    while needed != 0:
+        at = lowest_bit(needed) * LANES
+        needed &= needed - np.uint64(1)
+        _, _, power = log2_alpha(
+            batch, i, load(scratch, _COLUMN + at), load(scratch, _ROW + at))
+        a = exp2(minimum(power, LOG2_ALPHA_MAX))
+        a = select((power >= cutoff) & (load(scratch, _LAST + at) >= number), a, 0.0)
+        weight = a * (load(scratch, _T + at) / (1.0 - a))
+        error = fill(0.0)
+        for channel in range(3):
+            plane = _BEHIND_RED + channel * TILE_PIXELS + at
+            behind = load(scratch, plane)
+            away = broadcast(batch, i + RED + channel) - behind
+            store(scratch, plane, fma(a, away, behind))
+            error = fma(away, away, error)
+        loo = fma(weight * weight * load(scratch, _COUNTS + at), error, loo)
+    return loo

@@ -128,12 +128,19 @@ def find_patches(batch, patches, k, count):
 
 
 @inlined
+def row_terms(batch, at, row):
+    """Returns what u, v and log2 alpha have of a row of patches alone."""
+    v = fma(broadcast(batch, at + V_Y), row, broadcast(batch, at + V_0))
+    return (fma(broadcast(batch, at + U_Y), row, broadcast(batch, at + U_0)), v,
+            fma(-v, v, broadcast(batch, at + LOG2_OPACITY)))
+
+
+@inlined
 def log2_alpha(batch, at, column, row):
     """Returns u, v and log2 alpha at pixels of a tile: the same bits in both passes."""
-    u = fma(broadcast(batch, at + U_X), column,
-            fma(broadcast(batch, at + U_Y), row, broadcast(batch, at + U_0)))
-    v = fma(broadcast(batch, at + V_Y), row, broadcast(batch, at + V_0))
-    return u, v, fma(-v, v, fma(-u, u, broadcast(batch, at + LOG2_OPACITY)))
+    u_row, v, power_row = row_terms(batch, at, row)
+    u = fma(broadcast(batch, at + U_X), column, u_row)
+    return u, v, fma(-u, u, power_row)
 
 
 @inlined

@@ -20,8 +20,8 @@ from recon_cli.kernels.simd_functions import (
 TILE_WIDTH, TILE_HEIGHT = 2 * LANES, 16
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 # One vector is a patch of pixels: an ellipse of 8 x 8 pixels meets 8 patches of 4 x 4, but 12 rows
-# of 16. Pixels of a tile lie patch by patch, along rows of patches.
-PATCH_WIDTH, PATCH_HEIGHT = 4, LANES // 4
+# of 16. Pixels of a tile lie patch by patch, along four rows of eight patches.
+PATCH_WIDTH, PATCH_HEIGHT = LANES // 4, 4
 PATCHES_X, PATCHES_Y = TILE_WIDTH // PATCH_WIDTH, TILE_HEIGHT // PATCH_HEIGHT
 PATCHES = PATCHES_X * PATCHES_Y  # 32 whatever LANES is: a bit each
 

@@ -89,7 +89,7 @@ class PhotometricStep:
         view.backward(
             packed, PackedSplats.from_tensors(gradients.parameters().values()),
             ImageBuffers(grad_rgb, grad_alpha, grad_depth), self.statistics,
-            details=options.details, loo=options.loo, harmonics=options.harmonics)
+            loo=options.loo, harmonics=options.harmonics)
         return loss
 
     def _compare_depth(

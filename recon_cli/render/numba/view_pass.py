@@ -8,12 +8,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon_cli.render.contract import (
     ALPHA_MIN,
@@ -34,6 +32,9 @@ from recon_cli.kernels.viewpoint import viewpoint
 from recon_cli.kernels.thread_pool import SCRATCH_FLOATS, empty_aligned, pool
 from recon_cli.scene.camera import Camera
 
+if TYPE_CHECKING:  # without gradients a view is drawn without it
+    from torch import Tensor
+
 assert max(PROJECTION_FLOATS, GRADIENT_FLOATS, FORWARD_FLOATS, BACKWARD_FLOATS) <= SCRATCH_FLOATS
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class PackedSplats:
     stride: int
 
     @staticmethod
-    def from_tensors(tensors: Iterable[Tensor]) -> PackedSplats:
+    def from_tensors(tensors: Iterable[Tensor | NDArray[np.float32]]) -> PackedSplats:
         """Packs the raw parameters of splats: the same memory where they are contiguous."""
         *tensors, sh_rest = tensors
         means, quats, log_scales, logits, sh_dc = (flat(tensor) for tensor in tensors)
@@ -82,8 +83,10 @@ class RenderSettings:
     counting: NDArray[np.bool_] | None = None  # [H, W] pixels in the scores of both passes
 
 
-def flat(tensor: Tensor) -> NDArray[np.float32]:
-    """Returns a CPU tensor as a flat array: the same memory where it is contiguous."""
+def flat(tensor: Tensor | NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns a CPU tensor, or an array, as a flat array: the same memory where contiguous."""
+    if isinstance(tensor, np.ndarray):
+        return tensor.reshape(-1)
     array: NDArray[np.float32] = tensor.detach().contiguous().numpy().reshape(-1)
     return array
 
@@ -122,9 +125,9 @@ class ViewPass:
         if settings.scores:
             totals = statistics.hits, statistics.blend_sum, statistics.blend_max
             for total in totals:
-                total.zero_()
+                total[:] = 0
             tally(self.ids, self.slot_start, self.hits, self.weights, self.peaks,
-                  *(total.numpy() for total in totals))
+                  *(np.asarray(total) for total in totals))
 
     def crossing(
         self, splats: PackedSplats, camera: Camera, level: float, rows: NDArray[np.int32],
@@ -155,7 +158,7 @@ class ViewPass:
         self.records = self.take("records", m * RECORD)
         self.depths = self.take("depths", m, np.float64)
         self.rows = self.take("rows", 2 * m, np.int32)
-        statistics.radii.zero_()
+        statistics.radii[:] = 0
         pool.run(project, self.ids, splats.means, splats.quats, splats.log_scales,
                  splats.logit_opacities, splats.sh_dc, splats.sh_rest, splats.stride, self.terms,
                  self.view, ALPHA_MIN, self.records, self.depths, self.rows,
@@ -211,19 +214,19 @@ class ViewPass:
 
     def backward(
         self, splats: PackedSplats, gradients: PackedSplats, image: ImageBuffers,
-        statistics: Statistics, *, details: bool, loo: bool, harmonics: bool = True,
+        statistics: Statistics, *, loo: bool, harmonics: bool = True,
     ) -> None:
         """Writes gradients and statistics of all N Gaussians for the last forward pass.
 
         `image` holds the gradients of the loss; sh_rest of `gradients` is left alone at degree 0
-        and without `harmonics`. With `details` variance is written too, with `loo` that, over the
-        pixels that counted in the forward pass.
+        and without `harmonics`. With `loo` that is written too, over the pixels that counted in
+        the forward pass.
         """
         sums = self.take("sums", len(self.members) * SLOT)
         pool.run(
             composite_backward, self.tile_start, self.members, self.slots, self.records,
             self.view.width, self.view.height, self.tiles_x, self.cutoff, self.background,
-            self.final, self.last, self.met, image.rgb, image.alpha, image.depth, details, loo,
+            self.final, self.last, self.met, image.rgb, image.alpha, image.depth, loo,
             self.counting, sums)
         pool.run(
             project_backward, self.ids, self.block_starts, self.slot_start, sums, self.depths,
@@ -236,6 +239,8 @@ class ViewPass:
 
     def ellipse_gradients(self) -> EllipseGradients:
         """Returns what the last backward pass summed over the pixels of each Gaussian."""
+        import torch
+
         m = len(self.ids)
         sums = self.take("sums", len(self.members) * SLOT).reshape(-1, SLOT)[:, :S_VV + 1]
         totals = torch.segment_reduce(  # in order: the same bits every time

@@ -46,6 +46,7 @@ from recon_cli.sfm.mapping import mapper, merge_models
 from recon_cli.sfm.model_arrays import Pair, registered_images
 from recon_cli.sfm.segments.loop_closure import optimize_model
 from recon_cli.sfm.segments.view_overlap import WIDEST, overlapping_pairs
+from recon_cli.sfm.verdict.view_graph import components
 from recon_cli.workspace.steps import StepFolder
 
 MATCHES_DB = "linked.db"  # matches that may be used, in the folder of an attempt
@@ -251,15 +252,25 @@ def build_skeleton(
     models = mapper.map_incrementally(own, counts)
     # As tracks cannot be mistaken, lower thresholds do no harm. The global mapper gets past a turn
     # without parallax. What tracks of a long video leave apart is left to the matches.
-    whole = len(keyframes) == len(job.names)
+    whole, enough = len(keyframes) == len(job.names), ENOUGH_FRAMES * len(keyframes)
     for find_models in (mapper.map_relaxed, mapper.map_globally) if whole else ():
-        if _most(models) >= ENOUGH_FRAMES * len(keyframes):
+        if _most(models) >= enough or (
+                find_models is mapper.map_globally and _count_tied(own) < enough):
             break
         write_usable_matches(own, images, {}, tracks, rows, steps=ALL_TRACK_STEPS)
         models = max(models, find_models(own, counts), key=_most)
     shutil.rmtree(folder)
     models.sort(key=mapper.model_size, reverse=True)
     return models
+
+
+def _count_tied(job: MappingJob) -> int:
+    """Returns how many images verified pairs tie together at most, directly or not."""
+    row = {name: index for index, name in enumerate(job.names)}
+    ties = np.zeros((len(row), len(row)))
+    for first, second in matching.read_verified(job.database):
+        ties[row[first], row[second]] = 1
+    return max(map(len, components(ties)))
 
 
 def complete_tracked(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:

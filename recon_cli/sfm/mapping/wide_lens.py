@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +28,8 @@ ATTEMPT, OTHER = "fisheye", "lens"
 FISHEYE, ORDINARY = "OPENCV_FISHEYE", "SIMPLE_PINHOLE"
 # Focal lengths that are tried, in longer sides of the image; mapping corrects the rest. Of a
 # fisheye: from 180 degrees across the shorter side to about 75 across the longer one.
-FOCALS = tuple(0.22 * 1.2**step for step in range(7))
-ORDINARY_FOCALS = (0.5, 0.72, 1.04)
+FOCALS = tuple(0.22 * 1.2**step for step in reversed(range(7)))
+ORDINARY_FOCALS = (0.72, 0.5, 1.04)  # the most usual first: others end sooner
 # How many times as many matches a fisheye must explain as an ordinary lens. In the room `office` a
 # fisheye of 155 degrees explains 1.19 times as many and one of 104 degrees 1.06 times; for the
 # ordinary lenses of 17 captures it was 0.83 to 1.00.
@@ -54,30 +52,46 @@ def find_fisheyes(job: MappingJob) -> dict[int, float]:
         return {}
     samples, found = _read_samples(job), {}
     for number, group in unknown.items():
-        focal = _find_focal(
-            group, samples.get(number, []), seed=job.seed, threads=job.threads)
+        focal = _find_focal(group, samples.get(number, []), seed=job.seed)
         if focal is not None:
             found[number] = focal
     return found
 
 
 def _find_focal(
-    group: CameraGroup, samples: list[Sample], *, seed: int, threads: int
+    group: CameraGroup, samples: list[Sample], *, seed: int
 ) -> float | None:
     """Returns the focal length in pixels of a fisheye; None where it is an ordinary lens."""
     side, named = max(group.width, group.height), group.model != "auto"
     if sum(len(ours) for ours, _ in samples) < _LEAST_MATCHES and not named:
         return None
 
-    def most(model: str, shares: tuple[float, ...]) -> tuple[int, float]:
-        return max((sum(pool.map(
-            partial(count_explained, _camera(group, model, share * side), seed=seed), samples)),
-            share * side) for share in shares)
+    def most(model: str, shares: tuple[float, ...], least: float) -> tuple[float, float | None]:
+        focal = None
+        for share in shares:
+            count = _count_above(least, _camera(group, model, share * side), samples, seed=seed)
+            if count is not None:
+                least, focal = count, share * side
+        return least, focal
 
-    with ThreadPoolExecutor(threads) as pool:
-        count, focal = most(FISHEYE, FOCALS)
-        clear = named or count > CLEARLY * most(ORDINARY, ORDINARY_FOCALS)[0]
-    return focal if clear else None
+    ordinary = -1.0 if named else CLEARLY * most(ORDINARY, ORDINARY_FOCALS, 0)[0]
+    return most(FISHEYE, FOCALS, ordinary)[1]
+
+
+def _count_above(
+    least: float, camera: pycolmap.Camera, samples: list[Sample], *, seed: int
+) -> int | None:
+    """Returns how many matches a camera explains; None as soon as these can be no more than least.
+
+    That is where it would take more of the pairs to come than there are matches in them.
+    """
+    count, rest = 0, sum(len(ours) for ours, _ in samples)
+    for sample in samples:
+        if count + rest <= least:
+            return None
+        count += count_explained(camera, sample, seed=seed)
+        rest -= len(sample[0])
+    return count if count > least else None
 
 
 def map_fisheye(job: MappingJob, report: Reporter) -> list[pycolmap.Reconstruction]:

@@ -20,6 +20,7 @@ from torch import Tensor
 from recon_cli.errors import TrainingError
 from recon_cli.render.torch.projection import rotation_matrices
 from recon_cli.scene.splats import MOST_OPACITY, Splats, joined
+from recon_cli.splats.values import morton_order
 from recon_cli.train.fit.state import DensificationStats, TrainState
 from recon_cli.train.fit.task import Task
 
@@ -222,9 +223,20 @@ def _budget(state: TrainState, task: Task) -> None:
         rule = BudgetRule(
             schedule.target(state.iteration, state.first_count), schedule.config.min_opacity,
             schedule.recipe.opacity_decay, schedule.replaced)
-        replace_splats(state, *densify_budget(
+        splats, source = densify_budget(
             state.splats, state.gathered.variance * task.inside(state.splats.means), rule,
-            state.generator))
+            state.generator)
+        if len(splats) and task.device.type == "cpu":  # what a view sees lies together in memory
+            order = _spatial_order(splats)
+            splats, source = splats.select(order), source[order]
+        replace_splats(state, splats, source)
+
+
+def _spatial_order(splats: Splats) -> Tensor:
+    """Returns the rows [N] along a Z-order curve, those with coefficients first."""
+    order = torch.from_numpy(morton_order(splats.means.detach().numpy()))
+    plain = order >= len(splats.sh_rest)
+    return torch.cat([order[~plain], order[plain]])
 
 
 STRATEGIES = {"reference": Strategy(_reference), "budget": Strategy(_budget, variance=True)}

@@ -99,7 +99,8 @@ def load_prune_source(config: PruneConfig, inputs: StageInputs, ctx: StageContex
             "training is not known.", hint="Prune it with --at end.")
     if import_record and import_record.doubt:
         ctx.notice(import_record.doubt)
-    if model.config.compact_only:  # its training ended in the middle
+    if model.config.compact_only and config.at == "end":
+        ctx.notice("The training ended in its middle: pruning takes the steps that are left.")
         config = dataclasses.replace(config, at="mid")
     if config.at == "mid" and not single:
         ctx.notice("The blocks that the scene was trained in have no common middle: the finished "
