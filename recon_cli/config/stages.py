@@ -210,7 +210,7 @@ class TrainConfig(StageConfig):
         "auto", "Pixels to use; auto: by a trial.",
         choices=("auto", "denoised", "original"))
     background: str = option(
-        "auto", "Add a background; auto: by trial.",
+        "auto", "Add a background; auto: in rooms.",
         choices=("auto", "on", "off"), plain="off", formerly="far")
     stereo: str = option(
         "auto", "Start with Gaussians on surfaces that dense stereo finds and sparse points leave "
